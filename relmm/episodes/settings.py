@@ -1,0 +1,140 @@
+"""What a dataset is recorded with, and the checks that come before anything is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub.errors import HFValidationError
+from huggingface_hub.utils import validate_repo_id
+
+from relmm.episodes.folder import INFO, RELMM, DatasetFolder
+from relmm.errors import ConfigError, DatasetError
+from relmm.features import DEPTH_KEY, FPS, dataset_features
+
+# The columns that LeRobot adds by itself.
+LEROBOT_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+def features_to_store(depth: bool) -> dict[str, dict[str, Any]]:
+    """The schema as LeRobot stores it, with the unit of the depth picture."""
+    features = dataset_features(depth)
+    if depth:
+        features[DEPTH_KEY]["info"]["depth_unit"] = "mm"
+    return features
+
+
+def check_repo_id(repo_id: str) -> None:
+    """Refuse names that the Hub would refuse later.
+
+    Raises:
+        ConfigError: not of the form `user/name`, or with characters that the Hub does not allow.
+    """
+    try:
+        validate_repo_id(repo_id)
+    except HFValidationError as error:
+        reason = str(error).split("\n")[0].rstrip(".")
+        raise ConfigError(
+            f"{repo_id!r} cannot name a dataset ({reason}); use the form user/name with letters, digits, '-', '_' "
+            "and '.', for example me/first_run."
+        ) from error
+    if "/" not in repo_id:
+        raise ConfigError(f"{repo_id!r} cannot name a dataset, the user is missing; use the form user/name.")
+
+
+def check_new(root: Path, repo_id: str) -> None:
+    """Refuse a place where a new dataset cannot begin.
+
+    Raises:
+        ConfigError: LeRobot or the Hub would refuse the name.
+        DatasetError: there is something already.
+    """
+    check_repo_id(repo_id)
+    if root.exists() or root.is_symlink():
+        raise DatasetError(
+            f"{root} exists already and recording never overwrites; choose another folder, or resume this one."
+        )
+
+
+def check_resume(
+    root: Path, repo_id: str, depth: bool | None, robot_type: str | None, info: dict[str, Any] | None
+) -> bool:
+    """Refuse a folder that cannot be continued with these settings; reads only.
+
+    Args:
+        root: the dataset.
+        repo_id: its name, `user/name`.
+        depth: whether it must have the depth picture; None takes it as it is.
+        robot_type: the robot it must be of; None takes it as it is.
+        info: what the run is recorded with; its `camera` must be that of the dataset.
+
+    Returns:
+        Whether the dataset has the depth picture.
+
+    Raises:
+        ConfigError: LeRobot or the Hub would refuse the name.
+        DatasetError: no relmm dataset, or one with other settings: each difference is spelled out.
+    """
+    check_repo_id(repo_id)
+    have = _stored_settings(DatasetFolder(root))
+    has_depth = DEPTH_KEY in have["features"] if depth is None else depth
+    differences = _differences("fps", have["fps"], FPS)
+    differences += _feature_differences(have["features"], dataset_features(has_depth))
+    if robot_type is not None:
+        differences += _differences("robot type", have["robot_type"], robot_type)
+    if info is not None and "camera" in info and have["camera"] is not None:
+        differences += _differences("camera", have["camera"], info["camera"])
+    if differences:
+        raise DatasetError(
+            f"{root} cannot be continued with these settings: {'; '.join(differences)}; "
+            "record into a new folder, or use the settings of this one."
+        )
+    return has_depth
+
+
+def add_run(folder: DatasetFolder, depth: bool, robot_type: str | None, episode: int, info: dict[str, Any]) -> None:
+    """Write down in `meta/relmm.json` with what the episodes from `episode` on are recorded.
+
+    The file also keeps what `info.json` cannot be rebuilt without.
+    """
+    runs = (folder.read_json(RELMM) or {}).get("runs", [])
+    settings = {
+        "robot_type": robot_type,
+        "fps": FPS,
+        "features": features_to_store(depth),
+        "runs": [*runs, {"first_episode": episode, **info}],
+    }
+    folder.write_json(RELMM, settings)
+
+
+def _stored_settings(folder: DatasetFolder) -> dict[str, Any]:
+    if not folder.root.is_dir():
+        raise DatasetError(f"there is no dataset at {folder.root}; check the folder, or record without resuming.")
+    own = folder.read_json(RELMM) or {}
+    settings = folder.read_json(INFO) or own
+    if not {"features", "fps", "robot_type"} <= settings.keys() or not isinstance(settings["features"], dict):
+        raise DatasetError(
+            f"{folder.root} is no LeRobot dataset, it has no readable {INFO}; choose the folder of a dataset, "
+            "or a folder that does not exist yet to record a new one."
+        )
+    runs = own.get("runs", [])
+    camera = next((run["camera"] for run in reversed(runs) if "camera" in run), None)
+    return {**{key: settings[key] for key in ("features", "fps", "robot_type")}, "camera": camera}
+
+
+def _feature_differences(have: dict[str, Any], want: dict[str, Any]) -> list[str]:
+    differences: list[str] = []
+    for key in sorted((have.keys() | want.keys()) - set(LEROBOT_COLUMNS)):
+        differences += _differences(f"column {key}", _describe(have.get(key)), _describe(want.get(key)))
+    return differences
+
+
+def _describe(feature: dict[str, Any] | None) -> str:
+    if feature is None:
+        return "no such column"
+    names = feature.get("names")
+    return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" of {', '.join(names)}" if names else "")
+
+
+def _differences(name: str, have: Any, want: Any) -> list[str]:
+    return [] if have == want else [f"{name}: have {have}, want {want}"]

@@ -1,0 +1,136 @@
+"""The vocabulary: names, units and ranges of actions and observations, and the grid of grasp cells.
+
+Every part of relmm takes these names from here: robots, environments, policies and datasets.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+class Skill(IntEnum):
+    """What one action does (`skill.pos`)."""
+
+    NAVIGATE = 0
+    GRASP = 1
+    PLACE = 2
+
+
+class Phase(IntEnum):
+    """Who acted in a frame, and why (`complementary_info.phase`)."""
+
+    CURRICULUM = 0
+    LEARNING = 1
+    PSEUDO_RESET = 2
+    EVALUATION = 3
+
+
+# --- Actions -------------------------------------------------------------------------------------------------
+# Every name ends in `.vel` or `.pos`, because LeRobot's rollout drops all others.
+ACTION_NAMES = ("x.vel", "theta.vel", "skill.pos", "skill_x.pos", "skill_y.pos")
+
+# A navigation step: a drive pulse, then a brake. The authors' robot drives at most 0.106 m forward and turns at
+# most 27 degrees in one; the two limits below are those displacements divided by the length of the pulse.
+NAVIGATION_STEP_S = 0.5
+DRIVE_PULSE_S = 0.24
+MAX_X_VEL = 0.44  # m/s, never backwards
+MAX_THETA_VEL = 112.5  # deg/s, positive = left
+FPS = int(1 / NAVIGATION_STEP_S)  # frames per second of datasets and videos
+
+# Where a carried object is dropped to count as collected: the middle of the basket on the robot's right-hand side.
+BASKET_XY = (0.025, -0.1125)  # m, robot frame
+
+# --- Observations --------------------------------------------------------------------------------------------
+JOINT_NAMES = ("waist.pos", "shoulder.pos", "elbow.pos", "wrist_angle.pos", "wrist_rotate.pos")  # degrees
+# Velocities in m/s and deg/s; the gripper's opening in metres; holding 0 or 1; bumper: the sum of 1 (right),
+# 2 (centre) and 4 (left), as the Kobuki reports it.
+STATE_NAMES = ("x.vel", "theta.vel", *JOINT_NAMES, "gripper.pos", "holding.pos", "bumper.pos")
+
+FRONT = "front"
+FRONT_DEPTH = "front_depth"
+IMAGE_SIZE = 100  # pixels, square
+IMAGE_KEY = f"observation.images.{FRONT}"
+DEPTH_KEY = f"observation.images.{FRONT_DEPTH}"
+STATE_KEY = "observation.state"
+
+# --- Grasp cells ---------------------------------------------------------------------------------------------
+GRID = 15  # cells a side; the flat index is GRID * ix + iy
+GRASP_X = (0.30, 0.4667)  # m, robot frame, forward
+GRASP_Y = (-0.08, 0.08)  # m, robot frame, left
+
+
+def cell_to_xy(cell: int | FloatArray) -> FloatArray:
+    """Centre of a grasp cell.
+
+    Args:
+        cell: flat index or indices, 0..GRID**2 - 1, any shape.
+
+    Returns:
+        Metres in the robot frame, the shape of `cell` with (x, y) appended.
+    """
+    ix, iy = np.divmod(np.asarray(cell), GRID)
+    x = GRASP_X[0] + (ix + 0.5) * (GRASP_X[1] - GRASP_X[0]) / GRID
+    y = GRASP_Y[0] + (iy + 0.5) * (GRASP_Y[1] - GRASP_Y[0]) / GRID
+    return np.stack([x, y], axis=-1)
+
+
+def xy_to_cell(x: float, y: float) -> int:
+    """Flat index of the grasp cell that holds a point; points outside go to the nearest cell."""
+    ix = int((x - GRASP_X[0]) / (GRASP_X[1] - GRASP_X[0]) * GRID)
+    iy = int((y - GRASP_Y[0]) / (GRASP_Y[1] - GRASP_Y[0]) * GRID)
+    return GRID * min(max(ix, 0), GRID - 1) + min(max(iy, 0), GRID - 1)
+
+
+def in_grasp_area(x: float, y: float) -> bool:
+    """Whether a point of the floor (m, robot frame) lies in the rectangle of the grasp cells."""
+    return GRASP_X[0] <= x <= GRASP_X[1] and GRASP_Y[0] <= y <= GRASP_Y[1]
+
+
+def action_dict(
+    skill: Skill = Skill.NAVIGATE, x_vel: float = 0.0, theta_vel: float = 0.0, x: float = 0.0, y: float = 0.0
+) -> dict[str, float]:
+    """An action by name: a navigation step by default; `x` and `y` (m) say where to grasp or place."""
+    return dict(zip(ACTION_NAMES, (x_vel, theta_vel, float(skill), x, y), strict=True))
+
+
+# --- Datasets ------------------------------------------------------------------------------------------------
+def outcome_features() -> dict[str, dict[str, Any]]:
+    """The columns a recorded frame has beyond LeRobot's observation and action."""
+    scalar = {"shape": (1,), "names": None}
+    return {
+        "next.reward": {"dtype": "float32", **scalar},  # 1.0 when this frame's grasp picked something up
+        "next.done": {"dtype": "bool", **scalar},  # the episode ended with a success
+        "next.truncated": {"dtype": "bool", **scalar},  # the episode ended at its step limit
+        "next.success": {"dtype": "bool", **scalar},
+        "complementary_info.phase": {"dtype": "int64", **scalar},  # a `Phase`
+        "complementary_info.grasp_probability": {"dtype": "float32", **scalar},  # P[grasp], -1 where not asked
+        "complementary_info.robot_time": {"dtype": "float32", **scalar},  # s since the robot was connected
+    }
+
+
+def dataset_features(depth: bool = False) -> dict[str, dict[str, Any]]:
+    """The whole schema of a relmm dataset, as `LeRobotDataset.create(features=...)` takes it.
+
+    Args:
+        depth: also store the depth picture (millimetres).
+    """
+    size, names = IMAGE_SIZE, ["height", "width", "channels"]
+    features: dict[str, dict[str, Any]] = {
+        "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)},
+        STATE_KEY: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
+        IMAGE_KEY: {"dtype": "image", "shape": (size, size, 3), "names": names, "info": {"is_depth_map": False}},
+    }
+    if depth:
+        features[DEPTH_KEY] = {
+            "dtype": "image",
+            "shape": (size, size, 1),
+            "names": names,
+            "info": {"is_depth_map": True},
+        }
+    return features | outcome_features()

@@ -1,0 +1,1 @@
+"""Learning online: from here on the robot improves by itself."""

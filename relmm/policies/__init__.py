@@ -1,0 +1,1 @@
+"""LeRobot policies that clean a room: scripted and random controllers."""

@@ -1,0 +1,208 @@
+"""What the controllers without weights share: LeRobot's policy interface around one decision per robot."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import NormalizationMode
+from lerobot.optim.optimizers import AdamConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.processor import (
+    AddBatchDimensionProcessorStep,
+    DeviceProcessorStep,
+    NormalizerProcessorStep,
+    PolicyProcessorPipeline,
+    RenameObservationsProcessorStep,
+    UnnormalizerProcessorStep,
+)
+from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from numpy.typing import NDArray
+
+from relmm.errors import ConfigError
+from relmm.features import (
+    ACTION_NAMES,
+    BASKET_XY,
+    IMAGE_KEY,
+    IMAGE_SIZE,
+    MAX_THETA_VEL,
+    MAX_X_VEL,
+    STATE_KEY,
+    STATE_NAMES,
+    Skill,
+    action_dict,
+    cell_to_xy,
+)
+
+_HOLDING = STATE_NAMES.index("holding.pos")
+
+
+@dataclass
+class ControllerConfig(PreTrainedConfig):
+    """Settings that every controller has.
+
+    Args:
+        seed: of its random choices; each episode draws its own stream from it, however episodes are batched.
+        num_grasp: grasp attempts in a row after a navigation step (N_grasp of the paper).
+    """
+
+    seed: int = 0
+    num_grasp: int = 2
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.num_grasp < 1:
+            raise ConfigError(f"policy.num_grasp is {self.num_grasp}, but must be at least 1.")
+        if self.seed < 0:
+            raise ConfigError(f"policy.seed is {self.seed}, but must not be negative.")
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the present observation is used."""
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Only the present action is used."""
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Only the present reward is used."""
+
+    def get_optimizer_preset(self) -> AdamConfig:
+        """LeRobot asks for one; there is nothing to optimise."""
+        return AdamConfig()
+
+    def get_scheduler_preset(self) -> None:
+        """None."""
+
+    def validate_features(self) -> None:
+        """Check that the robot gives what the controller needs.
+
+        Raises:
+            ConfigError: no front camera, a picture of another size, or other state or action names.
+        """
+        image, state = self.input_features.get(IMAGE_KEY), self.input_features.get(STATE_KEY)
+        wanted = (3, IMAGE_SIZE, IMAGE_SIZE)
+        if image is None or tuple(image.shape) != wanted:
+            have = "none" if image is None else f"one of shape {tuple(image.shape)}"
+            raise ConfigError(f"{self.type} needs a picture {IMAGE_KEY} of shape {wanted}, but there is {have}.")
+        if state is None or tuple(state.shape) != (len(STATE_NAMES),):
+            raise ConfigError(f"{self.type} needs {STATE_KEY} to hold {', '.join(STATE_NAMES)}.")
+
+
+@dataclass
+class Row:
+    """What a controller remembers about one robot of a batch."""
+
+    rng: np.random.Generator
+    attempts: int = 0  # grasps since the last navigation step
+    memory: dict[str, Any] = field(default_factory=dict)
+
+
+class ControllerPolicy(PreTrainedPolicy):
+    """A LeRobot policy without weights that decides for one robot at a time."""
+
+    config_class = ControllerConfig
+    name = "relmm_controller"
+    config: ControllerConfig
+
+    def __init__(self, config: ControllerConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        # LeRobot looks at a policy's parameters to find its device.
+        self.placeholder = torch.nn.Parameter(torch.zeros(1), requires_grad=False)
+        self._rows: list[Row] = []
+        self._episodes = 0
+
+    @abstractmethod
+    def decide(self, image: NDArray[np.uint8], row: Row) -> dict[str, float]:
+        """Choose the next action of a robot with empty hands.
+
+        Args:
+            image: the front camera, (100, 100, 3).
+            row: what is remembered about this robot.
+        """
+
+    def reset(self) -> None:
+        """Begin new episodes."""
+        self._episodes += len(self._rows)
+        self._rows = []
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> torch.Tensor:
+        """One action a robot, float32 (batch, 5), in the order and units of `relmm.features.ACTION_NAMES`."""
+        images = (batch[IMAGE_KEY] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+        holding = (batch[STATE_KEY][:, _HOLDING] > 0.5).tolist()
+        while len(self._rows) < len(images):
+            stream = [self.config.seed, self._episodes + len(self._rows)]
+            self._rows.append(Row(np.random.default_rng(stream)))
+        actions = [self._act(*each) for each in zip(images, holding, self._rows, strict=False)]
+        return torch.tensor([[action[name] for name in ACTION_NAMES] for action in actions])
+
+    def _act(self, image: NDArray[np.uint8], holding: bool, row: Row) -> dict[str, float]:
+        if holding:
+            return action_dict(Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
+        action = self.decide(image, row)
+        row.attempts = row.attempts + 1 if action["skill.pos"] == Skill.GRASP else 0
+        return action
+
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> torch.Tensor:
+        """A chunk of one action, (batch, 1, 5)."""
+        return self.select_action(batch).unsqueeze(1)
+
+    def forward(self, batch: dict[str, Any], **kwargs: Any) -> tuple[torch.Tensor, dict[str, Any] | None]:
+        """Controllers do not learn.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError(f"{self.name} has nothing to train: choose a policy that learns.")
+
+    def get_optim_params(self) -> list[torch.nn.Parameter]:
+        """None of them learns."""
+        return []
+
+
+def grasp_cell(cell: int) -> dict[str, float]:
+    """The action that grasps at the centre of a cell."""
+    x, y = cell_to_xy(cell)
+    return action_dict(Skill.GRASP, x=float(x), y=float(y))
+
+
+def drive_anywhere(rng: np.random.Generator) -> dict[str, float]:
+    """A navigation step drawn uniformly from all of them."""
+    return action_dict(x_vel=rng.uniform(0, MAX_X_VEL), theta_vel=rng.uniform(-MAX_THETA_VEL, MAX_THETA_VEL))
+
+
+def make_identity_processors(
+    config: PreTrainedConfig, dataset_stats: dict[str, Any] | None
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+    """LeRobot's standard steps under their standard names, so that its overrides find them; nothing is normalised."""
+    features = {**config.input_features, **config.output_features}
+    norm_map = config.normalization_mapping
+    pre = [
+        RenameObservationsProcessorStep(rename_map={}),
+        AddBatchDimensionProcessorStep(),
+        DeviceProcessorStep(device=config.device),
+        NormalizerProcessorStep(features=features, norm_map=norm_map, stats=dataset_stats),
+    ]
+    post = [
+        UnnormalizerProcessorStep(features=config.output_features, norm_map=norm_map, stats=dataset_stats),
+        DeviceProcessorStep(device="cpu"),
+    ]
+    return (
+        PolicyProcessorPipeline(steps=pre, name="policy_preprocessor"),
+        PolicyProcessorPipeline(
+            steps=post,
+            name="policy_postprocessor",
+            to_transition=policy_action_to_transition,
+            to_output=transition_to_policy_action,
+        ),
+    )

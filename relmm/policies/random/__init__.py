@@ -1,0 +1,1 @@
+"""`--policy.type=relmm_random`: the paper's "Rand all" baseline."""

@@ -1,0 +1,1 @@
+"""`--policy.type=relmm_scripted`: the paper's OpenCV controller."""

@@ -1,0 +1,177 @@
+"""The LoCoBot's three skills over any body: one navigation step, grasp at (x, y), place at (x, y).
+
+Lengths, heights and the order of motions follow the authors' released code; the success of a grasp is judged from the
+gripper and the camera alone.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relmm.features import BASKET_XY, DRIVE_PULSE_S, MAX_THETA_VEL, NAVIGATION_STEP_S, FloatArray
+from relmm.geometry import arm_inverse
+from relmm.robot.body import MAX_OPENING, Body
+from relmm.robot.sensing import ObstacleDetector, grips_something, sees_held_object
+
+logger = logging.getLogger(__name__)
+
+_DOWN = np.pi / 2  # rad, tool pitch
+REST_POSE = np.array([0.0, -1.3, 1.58, 0.8, 0.0])  # rad; fingers just below the camera's view
+PRESENT_POSE = arm_inverse(0.42, 0.0, 0.20, pitch=0.0)  # gripper level in front of the camera, floor far behind it
+_ABOVE_Z, _GRASP_Z, _PLACE_Z = 0.10, 0.014, 0.018  # m, of the point between the pads
+_IN_BASKET = arm_inverse(*BASKET_XY, 0.20, pitch=_DOWN)
+_OVER_BASKET = arm_inverse(*BASKET_XY, 0.30, pitch=_DOWN)
+_BESIDE_BASKET = np.array([0.0, *_OVER_BASKET[1:]])  # the same height in front: the waist turns over the basket's rim
+_SQUEEZE = -0.005  # m, an opening that cannot be reached, so that the fingers press with all their force
+
+_WATCH_S = 0.04  # s between looks at the bumper and at the arm's tracking error
+_MAX_TRACKING_ERROR = 0.25  # rad; more means that the arm pushes against something
+_BACK_OFF_VEL, _BACK_OFF_S = -0.15, 0.4  # m/s and s, after the bumper was hit
+_MAX_TURNS = 14  # navigation steps of turning on the spot, a little over one round
+
+
+class Skills:
+    """Runs skills on a body, keeps its last picture, and remembers whether something is held.
+
+    Args:
+        body: simulated or real.
+        rng: decides which way to turn in front of an obstacle.
+    """
+
+    def __init__(self, body: Body, rng: np.random.Generator) -> None:
+        self._body = body
+        self._rng = rng
+        self._detector = ObstacleDetector(body.camera)
+        self._picture: tuple[NDArray[np.uint8], NDArray[np.uint16]] | None = None
+        self._grasped = False
+        self.last_velocity = (0.0, 0.0)  # m/s and deg/s, mean over the last drive pulse, from the wheel encoders
+        self.bumper = 0  # bits pressed during the last navigation step
+
+    @property
+    def holding(self) -> bool:
+        """Whether the last grasp was judged a success and the fingers are still kept apart."""
+        return self._grasped and grips_something(self._body.state().gripper)
+
+    def picture(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """Colour and depth, as `Body.capture`; taken anew only if time has passed since the last one."""
+        if self._picture is None:
+            self._picture = self._body.capture()
+        return self._picture
+
+    def rest(self) -> None:
+        """Fold the arm for driving."""
+        self._move(REST_POSE, 0.6)
+
+    def navigate(self, x_vel: float, theta_vel: float) -> None:
+        """One navigation step: a drive pulse, a brake, and a turn away from what stands in the way.
+
+        Args:
+            x_vel: m/s. theta_vel: deg/s, positive = left.
+        """
+        self.bumper = 0
+        self._pulse(x_vel, theta_vel)
+        bumped = self.bumper != 0
+        if bumped:
+            self._body.drive(_BACK_OFF_VEL, 0.0)
+            self._wait(_BACK_OFF_S)
+            self._brake()
+        self._turn_until_clear(at_least_once=bumped)
+
+    def grasp(self, x: float, y: float) -> bool:
+        """Try to pick up what lies at a point of the floor (m, robot frame), and say whether it worked.
+
+        A failed attempt ends at rest with open fingers, a successful one at rest with the object held.
+        """
+        self._body.set_gripper(MAX_OPENING)
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.6)
+        self._move(arm_inverse(x, y, _GRASP_Z, _DOWN), 0.35)
+        self._body.set_gripper(_SQUEEZE)
+        self._wait(0.3)
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.35)
+        self._grasped = grips_something(self._body.state().gripper) and self._present()
+        if not self._grasped:
+            self._body.set_gripper(MAX_OPENING)
+        self.rest()
+        return self.holding
+
+    def place(self, x: float, y: float) -> None:
+        """Put the held object down at a point of the floor (m, robot frame)."""
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.6)
+        self._move(arm_inverse(x, y, _PLACE_Z, _DOWN), 0.35)
+        self._release()
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.35)
+        self.rest()
+
+    def place_in_basket(self) -> None:
+        """Drop the held object into the basket at the robot's side."""
+        for pose in (_BESIDE_BASKET, _OVER_BASKET, _IN_BASKET):
+            self._move(pose, 0.7)
+        self._release()
+        for pose in (_OVER_BASKET, _BESIDE_BASKET, REST_POSE):
+            self._move(pose, 0.7)
+
+    def _release(self) -> None:
+        self._body.set_gripper(MAX_OPENING)
+        self._wait(0.3)
+        self._grasped = False
+
+    def _present(self) -> bool:
+        """Lift the gripper into view and look whether something is between the pads."""
+        self._move(PRESENT_POSE, 0.7)
+        state = self._body.state()
+        return sees_held_object(self.picture()[1], self._body.camera, state.joints, state.gripper)
+
+    def _turn_until_clear(self, at_least_once: bool) -> None:
+        direction = 0.0
+        for turn in range(_MAX_TURNS):
+            if not self._detector.obstructed(self.picture()[1]) and not (at_least_once and turn == 0):
+                return
+            direction = direction or float(self._rng.choice((-1.0, 1.0)))
+            self._pulse(0.0, direction * MAX_THETA_VEL)
+        logger.warning("Something obstructs the graspable area in every direction: the robot may be boxed in.")
+
+    def _pulse(self, x_vel: float, theta_vel: float) -> None:
+        before = self._body.state()
+        self._body.drive(x_vel, theta_vel)
+        self._watch(DRIVE_PULSE_S, self._bumped if x_vel > 0 else lambda: False)
+        self._brake()
+        after = self._body.state()
+        self.last_velocity = (
+            (after.travelled - before.travelled) / DRIVE_PULSE_S,
+            (after.heading - before.heading) / DRIVE_PULSE_S,
+        )
+
+    def _bumped(self) -> bool:
+        self.bumper |= self._body.state().bumper
+        return self.bumper != 0
+
+    def _brake(self) -> None:
+        self._body.drive(0.0, 0.0)
+        self._wait(NAVIGATION_STEP_S - DRIVE_PULSE_S)
+
+    def _move(self, joints: FloatArray, seconds: float) -> None:
+        """Move the arm, and stop it where it meets resistance."""
+        self._body.move_arm(joints, seconds)
+        if self._watch(seconds, self._arm_blocked):
+            self._body.move_arm(self._body.state().joints, _WATCH_S)
+        self._wait(0.1)
+
+    def _arm_blocked(self) -> bool:
+        state = self._body.state()
+        return bool(np.max(np.abs(state.joints - state.joint_goal)) > _MAX_TRACKING_ERROR)
+
+    def _watch(self, seconds: float, condition: Callable[[], bool]) -> bool:
+        """Let time pass until a condition holds; whether it did."""
+        for _ in range(round(seconds / _WATCH_S)):
+            self._wait(_WATCH_S)
+            if condition():
+                return True
+        return False
+
+    def _wait(self, seconds: float) -> None:
+        self._picture = None
+        self._body.wait(seconds)

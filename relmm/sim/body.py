@@ -1,0 +1,176 @@
+"""The LoCoBot's body in MuJoCo: its time is the simulation's, its sensors are all it tells."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from relmm.errors import PhysicsError
+from relmm.features import FloatArray
+from relmm.geometry import JOINT_LIMITS, CameraGeometry
+from relmm.robot.body import BUMPER_CENTRE, BUMPER_LEFT, BUMPER_RIGHT, MAX_OPENING, BodyState
+from relmm.robot.skills import REST_POSE
+from relmm.sim.model import CAMERA_NAME, ROBOT, build_model
+from relmm.sim.renderer import Renderer
+from relmm.sim.rooms import Room, set_objects
+from relmm.sim.truth import Truth
+
+_CONTROL_S = 0.02  # s between commands to the servos
+_WHEEL_RADIUS, _TRACK = 0.035, 0.230  # m
+_MAX_VELOCITY_CHANGE = np.array([2.2, 600.0]) * _CONTROL_S  # of 2.2 m/s^2 and 600 deg/s^2
+_BUMPER_FORCE = 2.0  # N; below that the Kobuki's bumper does not switch
+_JOINTS = ("waist", "shoulder", "elbow", "wrist_angle", "wrist_rotate")
+_WHEELS = ("wheel_left", "wheel_right")
+_MAX_DEPTH = 10.0  # m, the D435's range
+_SETTLE_S = 0.3
+
+
+class SimBody:
+    """A `relmm.robot.body.Body` whose time passes only in `wait`.
+
+    Args:
+        room: where the robot is put.
+        camera: its camera.
+    """
+
+    def __init__(self, room: Room, camera: CameraGeometry) -> None:
+        self.camera = camera
+        self.room = room
+        self.model = build_model(room, camera)
+        self.data = mujoco.MjData(self.model)
+        self.truth = Truth(self.model, self.data, room)
+        self._substeps = round(_CONTROL_S / self.model.opt.timestep)
+        self._renderer: Renderer | None = None
+        self._base_qpos = self._qpos("base")[0]
+        self._arm_qpos, self._arm_ctrl = self._qpos(*_JOINTS), self._ctrl(*_JOINTS)
+        self._wheel_qpos, self._wheel_ctrl = self._qpos(*_WHEELS), self._ctrl(*_WHEELS)
+        self._fingers_qpos, self._gripper_ctrl = self._qpos("finger_left", "finger_right"), self._ctrl("gripper")
+        self._shell, self._base = self.model.geom(ROBOT + "shell").id, self.model.body(ROBOT + "base").id
+
+    def _qpos(self, *joints: str) -> NDArray[np.intp]:
+        return np.array([self.model.joint(ROBOT + name).qposadr[0] for name in joints])
+
+    def _ctrl(self, *actuators: str) -> NDArray[np.intp]:
+        return np.array([self.model.actuator(ROBOT + name).id for name in actuators])
+
+    # --- The room ----------------------------------------------------------------------------------------
+    def reset(self, rng: np.random.Generator) -> None:
+        """Put the robot into the middle of the room, looking anywhere, and scatter the objects.
+
+        This is the only thing that ever moves something without physics: it starts a new life in a new room.
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        heading = rng.uniform(-np.pi, np.pi)
+        self.data.qpos[self._base_qpos : self._base_qpos + 7] = [
+            *(0.0, 0.0, 0.0),
+            *(np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)),
+        ]
+        set_objects(self.model, self.data, self.room.scatter(rng))
+        self.data.qpos[self._arm_qpos] = REST_POSE
+        self.data.qpos[self._fingers_qpos] = MAX_OPENING / 2
+        self._arm_start = self._arm_goal = REST_POSE
+        self._arm_times = (0.0, 1.0)
+        self._velocity = self._velocity_goal = np.zeros(2)
+        self.truth = Truth(self.model, self.data, self.room)
+        self.data.ctrl[self._gripper_ctrl] = MAX_OPENING / 2
+        self._command_arm()
+        self.wait(_SETTLE_S)
+
+    # --- Body --------------------------------------------------------------------------------------------
+    def drive(self, x_vel: float, theta_vel: float) -> None:
+        """See `Body.drive`."""
+        self._velocity_goal = np.array([x_vel, theta_vel])
+
+    def move_arm(self, joints: FloatArray, seconds: float) -> None:
+        """See `Body.move_arm`."""
+        self._arm_start = self.data.ctrl[self._arm_ctrl].copy()
+        self._arm_goal = np.clip(joints, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+        self._arm_times = (self.data.time, max(seconds, _CONTROL_S))
+
+    def set_gripper(self, opening: float) -> None:
+        """See `Body.set_gripper`."""
+        self.data.ctrl[self._gripper_ctrl] = min(opening, MAX_OPENING) / 2
+
+    def state(self) -> BodyState:
+        """See `Body.state`."""
+        left, right = self.data.qpos[self._wheel_qpos] * _WHEEL_RADIUS
+        return BodyState(
+            time=self.data.time,
+            travelled=(left + right) / 2,
+            heading=float(np.degrees((right - left) / _TRACK)),
+            joints=self.data.qpos[self._arm_qpos].copy(),
+            joint_goal=self.data.ctrl[self._arm_ctrl].copy(),
+            gripper=float(self.data.qpos[self._fingers_qpos].sum()),
+            bumper=self._bumper,
+        )
+
+    def capture(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """See `Body.capture`."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.model, ROBOT + CAMERA_NAME, self.camera.size)
+        rgb, depth = self._renderer.render(self.data)
+        return rgb, np.where(depth < _MAX_DEPTH, depth * 1000, 0).astype(np.uint16)
+
+    def wait(self, seconds: float) -> None:
+        """Advance the simulation, in whole control periods of 20 ms.
+
+        Raises:
+            PhysicsError: the simulation has left what is physically possible.
+        """
+        self._bumper = 0
+        for _ in range(max(round(seconds / _CONTROL_S), 1)):
+            self._command_wheels()
+            self._command_arm()
+            mujoco.mj_step(self.model, self.data, nstep=self._substeps)
+            if self._velocity.any():
+                self._bumper |= self._read_bumper()
+        self.truth.check()
+
+    def stop(self) -> None:
+        """See `Body.stop`."""
+        self._velocity = self._velocity_goal = np.zeros(2)
+        self.data.ctrl[self._wheel_ctrl] = 0.0
+        self.move_arm(self.data.qpos[self._arm_qpos].copy(), _CONTROL_S)
+
+    def close(self) -> None:
+        """See `Body.close`."""
+        self.stop()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    # --- Servos ------------------------------------------------------------------------------------------
+    def _command_wheels(self) -> None:
+        missing = self._velocity_goal - self._velocity
+        if not missing.any():
+            return
+        self._velocity = self._velocity + np.clip(missing, -_MAX_VELOCITY_CHANGE, _MAX_VELOCITY_CHANGE)
+        forward, turn = self._velocity[0], np.radians(self._velocity[1]) * _TRACK / 2
+        self.data.ctrl[self._wheel_ctrl] = np.array([forward - turn, forward + turn]) / _WHEEL_RADIUS
+
+    def _command_arm(self) -> None:
+        start, seconds = self._arm_times
+        if self.data.time > start + seconds:
+            return
+        progress = min((self.data.time - start + _CONTROL_S) / seconds, 1.0)
+        smooth = progress * progress * (3 - 2 * progress)
+        self.data.ctrl[self._arm_ctrl] = self._arm_start + (self._arm_goal - self._arm_start) * smooth
+
+    def _read_bumper(self) -> int:
+        contact = self.data.contact
+        pressed = 0
+        force = np.zeros(6)
+        for index in np.flatnonzero((contact.geom == self._shell).any(axis=1)):
+            mujoco.mj_contactForce(self.model, self.data, index, force)
+            if force[0] > _BUMPER_FORCE:
+                pressed |= self._bumper_bit(contact.pos[index])
+        return pressed
+
+    def _bumper_bit(self, point: FloatArray) -> int:
+        """Which third of the front half a contact point (m, world) touches; nothing at the back."""
+        local = self.data.xmat[self._base].reshape(3, 3).T @ (point - self.data.xpos[self._base])
+        angle = np.degrees(np.arctan2(local[1], local[0]))
+        if abs(angle) > 90:
+            return 0
+        return BUMPER_CENTRE if abs(angle) < 30 else BUMPER_LEFT if angle > 0 else BUMPER_RIGHT

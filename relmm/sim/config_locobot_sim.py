@@ -1,0 +1,44 @@
+"""`--robot.type=locobot_sim`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lerobot.robots.config import RobotConfig
+
+from relmm.geometry import camera_geometry
+from relmm.sim.rooms import Room, make_room
+
+
+@RobotConfig.register_subclass("locobot_sim")
+@dataclass(kw_only=True)
+class LocobotSimConfig(RobotConfig):
+    """A LoCoBot in a MuJoCo room.
+
+    Args:
+        room: name of a registered room.
+        num_objects: how many objects lie in it; None for the room's own number.
+        seed: where the objects lie and which way the robot looks at first.
+        camera: `paper` (the authors' simulated camera) or `d435` (a RealSense D435 on the LoCoBot's tower).
+        depth: whether observations hold the depth picture too.
+    """
+
+    room: str = "no_obstacles"
+    num_objects: int | None = None
+    seed: int = 0
+    camera: str = "paper"
+    depth: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        camera_geometry(self.camera)
+        self.make_room()
+
+    def make_room(self) -> Room:
+        """The room these settings describe.
+
+        Raises:
+            ConfigError: there is no such room, or its objects do not fit.
+        """
+        overrides = {} if self.num_objects is None else {"num_objects": self.num_objects}
+        return make_room(self.room, **overrides)

@@ -1,0 +1,60 @@
+"""`--env.type=relmm_room`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+
+from relmm.errors import ConfigError
+from relmm.features import ACTION_NAMES, FRONT, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
+from relmm.sim.config_locobot_sim import LocobotSimConfig
+
+ENV_ID = "gym_relmm_room/Room-v0"
+
+
+@EnvConfig.register_subclass("relmm_room")
+@dataclass
+class RelmmRoomEnvConfig(EnvConfig):
+    """The paper's evaluation: a room with scattered objects, 250 navigation steps, no pseudo-reset.
+
+    Args:
+        room, num_objects, camera: as in `LocobotSimConfig`.
+        navigation_steps: length of an episode.
+    """
+
+    task: str | None = "Room-v0"
+    fps: int = 8
+    room: str = "no_obstacles"
+    num_objects: int | None = None
+    camera: str = "paper"
+    navigation_steps: int = 250
+    render_mode: str = "rgb_array"
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            "action": PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(STATE_NAMES),)),
+            f"pixels/{FRONT}": PolicyFeature(type=FeatureType.VISUAL, shape=(IMAGE_SIZE, IMAGE_SIZE, 3)),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {"action": "action", "agent_pos": STATE_KEY, f"pixels/{FRONT}": IMAGE_KEY}
+    )
+
+    def __post_init__(self) -> None:
+        if self.navigation_steps < 1:
+            raise ConfigError(f"env.navigation_steps is {self.navigation_steps}, but must be at least 1.")
+        LocobotSimConfig(room=self.room, num_objects=self.num_objects, camera=self.camera)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `RelmmRoomEnv`."""
+        return {
+            "room": self.room,
+            "num_objects": self.num_objects,
+            "camera": self.camera,
+            "navigation_steps": self.navigation_steps,
+            "render_mode": self.render_mode,
+        }
