@@ -136,14 +136,12 @@ def picture_stats(pictures: NDArray[Any], unit: float) -> dict[str, NDArray[Any]
     Returns:
         LeRobot's keys, each (channels, 1, 1) but `count`, (1,).
     """
-    channels = pictures.shape[-1]
-    per_channel = [_CountedStats.of(pictures[..., i]) for i in range(channels)]
+    channels = [_CountedStats.of(pictures[..., i]) for i in range(pictures.shape[-1])]
     stats = {
-        key: np.concatenate([stats[key] for stats in per_channel]).reshape(channels, 1, 1) / unit
-        for key in per_channel[0]
-        if key != "count"
+        key: np.concatenate([channel[key] for channel in channels]).reshape(-1, 1, 1) / unit for key in channels[0]
     }
-    return {**stats, "count": np.array([len(pictures)])}
+    stats["count"] = np.array([len(pictures)])  # of pictures, where a channel counts pixels
+    return stats
 
 
 class _CountedStats(RunningQuantileStats):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+import weakref
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from lerobot.robots.config import RobotConfig
@@ -73,6 +74,13 @@ class LocobotRobot(Robot):
         """Names with `float`."""
         return dict.fromkeys(ACTION_NAMES, float)
 
+    _connected: ClassVar[weakref.WeakSet[LocobotRobot]] = weakref.WeakSet()
+
+    @classmethod
+    def connected(cls) -> list[LocobotRobot]:
+        """The LoCoBots that are connected in this process."""
+        return [robot for robot in cls._connected if robot.is_connected]
+
     # --- Connection --------------------------------------------------------------------------------------
     @property
     def is_connected(self) -> bool:
@@ -99,6 +107,7 @@ class LocobotRobot(Robot):
         if self._body is not None:
             raise RobotError(f"{self} is connected already: call disconnect() first.")
         self._body = self.make_body()
+        self._connected.add(self)
         self.start_skills(self._seed)
 
     def start_skills(self, seed: int) -> None:

@@ -11,6 +11,7 @@ from relmm.features import FloatArray
 from relmm.geometry import JOINT_LIMITS, CameraGeometry
 from relmm.robot.body import BUMPER_CENTRE, BUMPER_LEFT, BUMPER_RIGHT, MAX_OPENING, BodyState
 from relmm.robot.skills import REST_POSE
+from relmm.sim.basket import Basket
 from relmm.sim.model import CAMERA_NAME, ROBOT, build_model
 from relmm.sim.renderer import Renderer
 from relmm.sim.rooms import Room, set_objects
@@ -40,6 +41,7 @@ class SimBody:
         self.model = build_model(room, camera)
         self.data = mujoco.MjData(self.model)
         self.truth = Truth(self.model, self.data, room)
+        self._basket = Basket(self.model, self.data, self.truth.object_ids)
         self._substeps = round(_CONTROL_S / self.model.opt.timestep)
         self._renderer: Renderer | None = None
         self._base_qpos = self._qpos("base")[0]
@@ -61,6 +63,7 @@ class SimBody:
         This is the only thing that ever moves something without physics: it starts a new life in a new room.
         """
         mujoco.mj_resetData(self.model, self.data)
+        self._basket.empty()
         heading = rng.uniform(-np.pi, np.pi)
         self.data.qpos[self._base_qpos : self._base_qpos + 7] = [
             *(0.0, 0.0, 0.0),
@@ -80,6 +83,7 @@ class SimBody:
     # --- Body --------------------------------------------------------------------------------------------
     def drive(self, x_vel: float, theta_vel: float) -> None:
         """See `Body.drive`."""
+        self._basket.stow(self.truth.in_basket())
         self._velocity_goal = np.array([x_vel, theta_vel])
 
     def move_arm(self, joints: FloatArray, seconds: float) -> None:
@@ -122,6 +126,7 @@ class SimBody:
         for _ in range(max(round(seconds / _CONTROL_S), 1)):
             self._command_wheels()
             self._command_arm()
+            self._basket.carry()
             mujoco.mj_step(self.model, self.data, nstep=self._substeps)
             if self._velocity.any():
                 self._bumper |= self._read_bumper()

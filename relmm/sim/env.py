@@ -113,7 +113,7 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def _info(self) -> dict[str, Any]:
         truth, total = self.robot.body.truth, self.robot.body.room.num_objects
-        collected = truth.in_basket()
+        collected = len(truth.in_basket())
         return {
             "is_success": collected >= SUCCESS_SHARE * total,
             "objects_collected": collected,

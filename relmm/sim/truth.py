@@ -6,6 +6,7 @@ import logging
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from relmm.errors import PhysicsError
 from relmm.features import BASKET_XY, FloatArray
@@ -28,14 +29,14 @@ class Truth:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, room: Room) -> None:
         self._data, self._room = data, room
         names = [model.body(i).name for i in range(model.nbody)]
-        self._objects = np.array([i for i, name in enumerate(names) if name.startswith(OBJECT_PREFIX)])
+        self.object_ids = np.array([i for i, name in enumerate(names) if name.startswith(OBJECT_PREFIX)])
         self._base = model.body(ROBOT + "base").id
         self._tool = model.site(ROBOT + "tool").id
         self._reported: set[int] = set()
 
     def objects(self) -> FloatArray:
         """Centres of the objects, m, world frame, shape (n, 3)."""
-        return self._data.xpos[self._objects].copy()
+        return self._data.xpos[self.object_ids].copy()
 
     def objects_in_robot_frame(self) -> FloatArray:
         """Centres of the objects, m, robot frame, shape (n, 3)."""
@@ -54,17 +55,17 @@ class Truth:
         near = np.linalg.norm(objects - self._data.site_xpos[self._tool], axis=1) < _HELD_DISTANCE
         return bool(np.any(near & (objects[:, 2] > _HELD_HEIGHT)))
 
-    def in_basket(self) -> int:
-        """How many objects lie in the robot's basket."""
+    def in_basket(self) -> NDArray[np.intp]:
+        """Numbers of the objects that lie in the robot's basket."""
         x, y, z = self.objects_in_robot_frame().T
         inside = (np.abs(x - BASKET_XY[0]) < _BASKET_SIZE[0]) & (np.abs(y - BASKET_XY[1]) < _BASKET_SIZE[1])
-        return int(np.sum(inside & (z > _BASKET_HEIGHT[0]) & (z < _BASKET_HEIGHT[1])))
+        return np.flatnonzero(inside & (z > _BASKET_HEIGHT[0]) & (z < _BASKET_HEIGHT[1]))
 
-    def lost(self) -> list[int]:
-        """Indices of objects that physics has let through a wall or the floor."""
+    def lost(self) -> NDArray[np.intp]:
+        """Numbers of the objects that physics has let through a wall or the floor."""
         x, y, z = self.objects().T
         half_x, half_y = np.array(self._room.size) / 2
-        return np.flatnonzero((np.abs(x) > half_x) | (np.abs(y) > half_y) | (z < _FALLEN_BELOW)).tolist()
+        return np.flatnonzero((np.abs(x) > half_x) | (np.abs(y) > half_y) | (z < _FALLEN_BELOW))
 
     def check(self) -> None:
         """Report what cannot be.
@@ -79,6 +80,6 @@ class Truth:
             raise PhysicsError(f"The robot left the room at ({x:.2f}, {y:.2f}) m, {self._data.time:.2f} s.")
         if self._data.xmat[self._base][8] < _MAX_TILT:
             raise PhysicsError(f"The robot tipped over at {self._data.time:.2f} s.")
-        for index in set(self.lost()) - self._reported:
+        for index in set(self.lost().tolist()) - self._reported:
             self._reported.add(index)
             logger.warning("Object %d left the room through a wall or the floor at %.2f s.", index, self._data.time)

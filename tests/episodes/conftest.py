@@ -24,5 +24,5 @@ def remove_hf_home():
 def forkserver():
     """Processes that can be killed, without importing LeRobot in each."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["relmm.episodes.lerobot_writer", "episode_helpers"])
+    context.set_forkserver_preload(["relmm.episodes.lerobot_writer", "episode_children"])
     return context

@@ -1,0 +1,102 @@
+"""The scripted controller as a LeRobot `Teleoperator`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.teleoperators.teleoperator import Teleoperator
+
+from relmm.errors import RobotError
+from relmm.features import (
+    ACTION_NAMES,
+    FRONT,
+    IMAGE_KEY,
+    IMAGE_SIZE,
+    STATE_KEY,
+    STATE_NAMES,
+)
+from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
+from relmm.policies.scripted.modeling_scripted import RelmmScriptedPolicy
+from relmm.robot.locobot import LocobotRobot
+from relmm.teleoperator.config_locobot_scripted import LocobotScriptedConfig
+
+
+class LocobotScripted(Teleoperator):
+    """Looks through the eyes of the LoCoBot that is connected in this process, as a person beside it would."""
+
+    config_class = LocobotScriptedConfig
+    name = "locobot_scripted"
+
+    def __init__(self, config: LocobotScriptedConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self._policy: RelmmScriptedPolicy | None = None
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        """The robot's."""
+        return dict.fromkeys(ACTION_NAMES, float)
+
+    @property
+    def feedback_features(self) -> dict[str, Any]:
+        """None."""
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether `connect` was called."""
+        return self._policy is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Always."""
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing to do."""
+
+    def configure(self) -> None:
+        """Nothing to do."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Start the controller."""
+        image = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
+        state = PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))
+        self._policy = RelmmScriptedPolicy(
+            RelmmScriptedConfig(
+                input_features={IMAGE_KEY: image, STATE_KEY: state},
+                camera=self.config.camera,
+                seed=self.config.seed,
+                device="cpu",
+            )
+        )
+
+    def get_action(self) -> dict[str, float]:
+        """What the controller would do now.
+
+        Raises:
+            RobotError: not connected, or not exactly one LoCoBot is connected in this process.
+        """
+        if self._policy is None:
+            raise RobotError(f"{self} is not connected: call connect() first.")
+        robots = LocobotRobot.connected()
+        if len(robots) != 1:
+            raise RobotError(
+                f"locobot_scripted needs exactly one connected LoCoBot in this process, but there are {len(robots)}: "
+                "use it with --robot.type=locobot_sim."
+            )
+        observation = robots[0].get_observation()
+        batch = {
+            IMAGE_KEY: torch.from_numpy(observation[FRONT]).permute(2, 0, 1)[None] / 255,
+            STATE_KEY: torch.tensor([[observation[name] for name in STATE_NAMES]]),
+        }
+        return dict(zip(ACTION_NAMES, self._policy.select_action(batch)[0].tolist(), strict=True))
+
+    def send_feedback(self, feedback: dict[str, Any]) -> None:
+        """Nothing to do."""
+
+    def disconnect(self) -> None:
+        """Stop the controller."""
+        self._policy = None

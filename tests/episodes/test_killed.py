@@ -1,0 +1,101 @@
+"""Every saved episode survives SIGKILL at every step of a save."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from episode_children import die_at_rename, die_in_first_save, fill_limited_files
+from episode_helpers import REPO_ID, TASK, arguments, check_dataset, length_of, load, new_dataset, record
+
+from relmm.episodes import DurableDataset, EpisodeRecorder, summarize
+from relmm.errors import DatasetError
+
+PROJECT = Path(__file__).parents[2]
+
+
+def run(forkserver, function, *arguments):
+    process = forkserver.Process(target=function, args=arguments)
+    process.start()
+    process.join(60)
+    return process.exitcode
+
+
+# An episode of a known task is published by four renames: data, meta/episodes, stats, info.
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+@pytest.mark.parametrize("before", [True, False])
+def test_killed_between_the_renames_of_a_save(tmp_path, forkserver, number, before):
+    root = tmp_path / "d"
+    new_dataset(root, 1)
+    assert run(forkserver, die_at_rename, root, 1, number, before) == -signal.SIGKILL
+    stock = load(root)  # as it is, without a repair
+    assert stock.num_episodes >= 2
+    assert {int(index) for index in stock.hf_dataset["episode_index"]} >= {0, 1}
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        saved = dataset.episodes
+        # Once data and metadata of the episode are there, it is whole, even if nobody was told.
+        assert saved == (3 if number > 2 or (number == 2 and not before) else 2)
+        record(dataset, range(saved, saved + 1))
+    check_dataset(root, saved + 1)
+    assert summarize(root).episodes == saved + 1
+
+
+def test_killed_in_the_first_save(tmp_path, forkserver):
+    root = tmp_path / "d"
+    assert run(forkserver, die_in_first_save, root) == -signal.SIGKILL
+    with DurableDataset.open(root, REPO_ID) as dataset:  # the lock of the dead is free
+        assert dataset.episodes == 0
+        record(dataset, range(2))
+    check_dataset(root, 2)
+
+
+@pytest.mark.parametrize("allowed", [2_000, 20_000, 100_000])
+def test_a_refused_write_leaves_the_earlier_episodes_whole(tmp_path, forkserver, allowed):
+    root = tmp_path / "d"
+    new_dataset(root, 1)
+    assert run(forkserver, fill_limited_files, root, allowed) == 7
+    check_dataset(root, 1)
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        record(dataset, range(1, 2))
+    check_dataset(root, 2)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=2M", "tmpfs", str(disk)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("cannot mount a small disk here")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_full_disk(small_disk):
+    root = small_disk / "d"
+    settings = {"depth": False, "robot_type": "locobot_sim", "info": {}}
+    recorder = EpisodeRecorder(root, REPO_ID, resume=False, **settings)
+    with pytest.raises(DatasetError, match=r"No space left on device.*episodes are saved and whole"), recorder:
+        for episode in range(1000):
+            for step in range(length_of(episode)):
+                recorder.add_frame(*arguments(episode, step), TASK)
+            recorder.save_episode()
+    assert recorder.saved_episodes >= 5
+    check_dataset(root, recorder.saved_episodes)
+
+
+def test_random_kills_of_a_whole_recording(tmp_path):
+    """A few rounds of the benchmark; it kills recorder and writer at once."""
+    table = tmp_path / "kills.csv"
+    script = PROJECT / "benchmarks" / "kill_recording.py"
+    command = [sys.executable, str(script), "--kills", "2", "--seed", "5", "--output", str(table)]
+    result = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": str(PROJECT)}, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    rows = list(csv.DictReader(table.open()))
+    assert len(rows) == 2
+    assert all(int(row["unreadable"]) == 0 for row in rows)

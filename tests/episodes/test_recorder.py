@@ -1,0 +1,108 @@
+"""Recording behind the loop."""
+
+import os
+import signal
+import time
+
+import pytest
+from episode_helpers import INFO, REPO_ID, TASK, arguments, check_dataset, length_of, new_dataset
+
+from relmm.episodes import EpisodeRecorder, summarize
+from relmm.errors import ConfigError, DatasetError
+
+SETTINGS = {"depth": False, "robot_type": "locobot_sim", "info": INFO}
+
+
+def add_episode(recorder, episode, steps=None):
+    for step in range(length_of(episode) if steps is None else steps):
+        recorder.add_frame(*arguments(episode, step), TASK)
+
+
+def test_a_slow_writer_makes_the_loop_wait_and_loses_nothing(tmp_path):
+    with EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, buffered_frames=4, **SETTINGS) as recorder:
+        os.kill(recorder._process.pid, signal.SIGSTOP)
+        started = time.monotonic()
+        signal.signal(signal.SIGALRM, lambda *_: os.kill(recorder._process.pid, signal.SIGCONT))
+        signal.setitimer(signal.ITIMER_REAL, 1.0)
+        for episode in range(12):  # more than fits into the queue and the pipe
+            add_episode(recorder, episode)
+            recorder.save_episode()
+        assert time.monotonic() - started >= 1.0
+        add_episode(recorder, 99)
+        recorder.discard_episode()
+        recorder.flush()
+        assert recorder.saved_episodes == 12
+        add_episode(recorder, 12, steps=1)  # not asked to be saved
+    with pytest.raises(DatasetError, match="closed"):
+        recorder.save_episode()
+    check_dataset(tmp_path / "d", 12)
+
+
+def test_the_unfinished_episode_is_saved_where_asked(tmp_path, capfd):
+    new_dataset(tmp_path / "d", 1)
+
+    def interrupted():
+        with EpisodeRecorder(tmp_path / "d", REPO_ID, resume=True, save_unfinished=True, **SETTINGS) as recorder:
+            assert recorder.saved_episodes == 1
+            assert recorder.repaired == ""
+            add_episode(recorder, 1)
+            os.kill(recorder._process.pid, signal.SIGINT)  # Ctrl-C reaches the whole process group
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    check_dataset(tmp_path / "d", 2)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_killed_writer_is_reported_and_the_saved_episodes_are_whole(tmp_path):
+    recorder = EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, **SETTINGS)
+    add_episode(recorder, 0)
+    recorder.save_episode()
+    recorder.flush()
+    os.kill(recorder._process.pid, signal.SIGKILL)
+    with pytest.raises(DatasetError, match="the 1 episodes saved so far are whole"):
+        for _ in range(1000):
+            add_episode(recorder, 1)
+    with pytest.raises(DatasetError, match="are whole"):
+        recorder.save_episode()
+    recorder.close()
+    check_dataset(tmp_path / "d", 1)
+
+
+def test_bad_settings_are_refused_before_anything_starts(tmp_path):
+    new_dataset(tmp_path / "d", 1)
+    started = time.monotonic()
+    with pytest.raises(DatasetError, match="exists already"):
+        EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, **SETTINGS)
+    with pytest.raises(DatasetError, match="camera: have paper, want d435"):
+        EpisodeRecorder(tmp_path / "d", REPO_ID, resume=True, **SETTINGS | {"info": {"camera": "d435"}})
+    with pytest.raises(DatasetError, match="there is no dataset"):
+        EpisodeRecorder(tmp_path / "nothing", REPO_ID, resume=True, **SETTINGS)
+    with pytest.raises(ConfigError, match="user/name"):
+        EpisodeRecorder(tmp_path / "new", "noslash", resume=False, **SETTINGS)
+    assert time.monotonic() - started < 1
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_what_the_writer_refuses_is_raised_here(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(DatasetError, match=r"cannot be written \(Not a directory\)"):
+        EpisodeRecorder(tmp_path / "file" / "d", REPO_ID, resume=False, **SETTINGS)
+
+
+def test_summary_counts_what_is_on_disk(tmp_path):
+    new_dataset(tmp_path / "d", 4)  # 3 + 4 + 5 + 6 frames; step % 3 == 1 grasps, step % 6 == 1 succeeds
+    summary = summarize(tmp_path / "d")
+    assert (summary.episodes, summary.frames) == (4, 18)
+    assert list(summary.frames_by_phase.values()) == [6, 5, 4, 3]
+    assert (summary.grasps, summary.successful_grasps) == (6, 4)
+    assert (summary.ended_by_success, summary.truncated) == (2, 2)
+    assert summary.seconds == 9.0
+    assert summary.robot_seconds == pytest.approx(0.5 * (2 + 3 + 4 + 5))
+    assert "4 (2 by success, 2 truncated)" in str(summary)
+    (tmp_path / "d/data/chunk-000/file-001.parquet").write_bytes(b"")
+    with pytest.raises(DatasetError, match="repair the dataset"):
+        summarize(tmp_path / "d")
+    with pytest.raises(DatasetError, match="no episodes"):
+        summarize(tmp_path / "nothing")
