@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import os
 import select
 import shutil
@@ -46,7 +47,7 @@ def record(root: Path, resume: bool) -> None:
     from relmm.episodes import EpisodeRecorder
     from relmm.features import STATE_NAMES, action_dict, outcome_features
 
-    outcome = {key: 0 for key in outcome_features()}
+    outcome = dict.fromkeys(outcome_features(), 0)
     state = dict.fromkeys(STATE_NAMES, 0.0)
     with EpisodeRecorder(root, REPO_ID, resume=resume, depth=False, robot_type="none", info={}) as recorder:
         episode = recorder.saved_episodes
@@ -63,7 +64,8 @@ def record(root: Path, resume: bool) -> None:
 def kill_one(root: Path, resume: bool, delay: float) -> int:
     """Start a recording, kill it `delay` seconds after its start-up, and return what it had acknowledged."""
     command = [sys.executable, __file__, "--record", str(root), *(["--resume"] if resume else [])]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as process:
+    # Unbuffered: what a buffer has read ahead would come after what is read past it.
+    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True, bufsize=0) as process:
         assert process.stdout is not None
         output = process.stdout.readline()  # the start-up is over
         end = time.monotonic() + delay
@@ -72,7 +74,11 @@ def kill_one(root: Path, resume: bool, delay: float) -> int:
                 output += os.read(process.stdout.fileno(), 65536)
         os.killpg(process.pid, signal.SIGKILL)
         output += process.stdout.read()
-    return int(output.decode().rsplit("\n", 2)[-2])
+    counts = [int(line) for line in output.decode().split("\n")[:-1]]
+    # The queue of the recorder holds no more than 25 episodes, so the count cannot jump further.
+    if any(not 0 <= b - a <= 25 for a, b in itertools.pairwise(counts)):
+        raise RuntimeError(f"the acknowledgements are out of order, so this round shows nothing: {counts}")
+    return counts[-1]
 
 
 def readable_episodes(root: Path, checked: int) -> int:
@@ -103,30 +109,32 @@ def run(kills: int, seed: int, output: Path) -> bool:
     """The whole benchmark; returns whether every acknowledged episode was readable."""
     random = np.random.default_rng(seed)
     folder = Path(tempfile.mkdtemp(prefix="relmm-kills-"))
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, float]] = []
     checked = 0
     for number in range(kills):
         root, fresh = folder / str(number // ROUNDS_PER_DATASET), number % ROUNDS_PER_DATASET == 0
         delay = float(random.uniform(0.1, 2.0))
         acknowledged = kill_one(root, resume=not fresh, delay=delay)
-        readable = readable_episodes(root, 0 if fresh else checked) if acknowledged else 0
-        checked = readable
-        row = {"kill": number, "seed": seed, "delay_s": round(delay, 3), "acknowledged": acknowledged}
-        rows.append({**row, "readable": readable, "unreadable": max(0, acknowledged - readable)})
+        before = 0 if fresh else checked
+        readable = checked = readable_episodes(root, before) if acknowledged else 0
+        row = {"kill": number, "seed": seed, "delay_s": round(delay, 3), "before": before}
+        row |= {"acknowledged": acknowledged, "readable": readable, "unreadable": max(0, acknowledged - readable)}
+        rows.append(row)
         print(f"{number + 1}/{kills}: acknowledged {acknowledged}, readable {readable}", file=sys.stderr, flush=True)
     shutil.rmtree(folder)
     write_table(rows, output)
     return not any(row["unreadable"] for row in rows)
 
 
-def write_table(rows: list[dict[str, object]], output: Path) -> None:
-    """Write a row a kill as CSV, and print the sums over the kills."""
+def write_table(rows: list[dict[str, float]], output: Path) -> None:
+    """Write a row a kill as CSV, counting whole datasets, and print the sums, counting each episode once."""
     output.parent.mkdir(parents=True, exist_ok=True)
     with output.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)
-    sums = [sum(int(str(row[key])) for row in rows) for key in ("acknowledged", "readable", "unreadable")]
+    new = [sum(row[key] - row["before"] for row in rows) for key in ("acknowledged", "readable")]
+    sums = [*new, sum(row["unreadable"] for row in rows)]
     print("kills  episodes acknowledged before the kill  readable after  unreadable")
     print(f"{len(rows):5}  {sums[0]:39}  {sums[1]:14}  {sums[2]:10}")
 

@@ -69,7 +69,7 @@ def _vector(what: str, values: Mapping[str, Any], names: tuple[str, ...]) -> NDA
         raise DatasetError(f"the {what} has no {error.args[0]!r}; a frame needs {', '.join(names)}.") from error
     if not np.isfinite(vector).all():
         bad = {name: values[name] for name, ok in zip(names, np.isfinite(vector), strict=True) if not ok}
-        raise DatasetError(f"the {what} has values that are not finite numbers, {bad}; no policy could learn from them.")
+        raise DatasetError(f"the {what} has values that are not finite numbers, {bad}; nothing could learn from them.")
     return vector
 
 

@@ -99,7 +99,7 @@ def repair(folder: DatasetFolder) -> RepairReport:
 def _rebuilt_info(folder: DatasetFolder) -> dict[str, Any]:
     from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
     from lerobot.datasets.feature_utils import create_empty_dataset_info
-    from lerobot.datasets.utils import DEFAULT_FEATURES
+    from lerobot.utils.constants import DEFAULT_FEATURES
 
     own = folder.read_json(RELMM)
     if own is None:

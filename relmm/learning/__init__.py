@@ -1,1 +1,1 @@
-"""Learning online: from here on the robot improves by itself."""
+"""The loop around a robot and a policy: acting, pseudo-resets, recording."""

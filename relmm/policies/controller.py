@@ -46,11 +46,12 @@ class ControllerConfig(PreTrainedConfig):
     """Settings that every controller has.
 
     Args:
-        seed: of its random choices; each episode draws its own stream from it, however episodes are batched.
+        seed: of its random choices; each episode draws its own stream from it, however episodes are batched. None for
+            that of the command, or 0.
         num_grasp: grasp attempts in a row after a navigation step (N_grasp of the paper).
     """
 
-    seed: int = 0
+    seed: int | None = None
     num_grasp: int = 2
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
@@ -60,7 +61,7 @@ class ControllerConfig(PreTrainedConfig):
         super().__post_init__()
         if self.num_grasp < 1:
             raise ConfigError(f"policy.num_grasp is {self.num_grasp}, but must be at least 1.")
-        if self.seed < 0:
+        if self.seed is not None and self.seed < 0:
             raise ConfigError(f"policy.seed is {self.seed}, but must not be negative.")
 
     @property
@@ -141,7 +142,7 @@ class ControllerPolicy(PreTrainedPolicy):
         images = (batch[IMAGE_KEY] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
         holding = (batch[STATE_KEY][:, _HOLDING] > 0.5).tolist()
         while len(self._rows) < len(images):
-            stream = [self.config.seed, self._episodes + len(self._rows)]
+            stream = [self.config.seed or 0, self._episodes + len(self._rows)]
             self._rows.append(Row(np.random.default_rng(stream)))
         actions = [self._act(*each) for each in zip(images, holding, self._rows, strict=False)]
         return torch.tensor([[action[name] for name in ACTION_NAMES] for action in actions])

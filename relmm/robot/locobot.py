@@ -143,6 +143,10 @@ class LocobotRobot(Robot):
             raise RobotError(f"{self} is not connected: call connect() first.")
         return self._skills
 
+    def seconds(self) -> float:
+        """The robot's own clock, s since it was connected."""
+        return self.body.state().time
+
     # --- Observation and action --------------------------------------------------------------------------
     def get_observation(self) -> dict[str, Any]:
         """The sensors now: `STATE_NAMES` as floats and the pictures as arrays."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +46,7 @@ class SimBody:
         self._basket = Basket(self.model, self.data, self.truth.object_ids)
         self._substeps = round(_CONTROL_S / self.model.opt.timestep)
         self._renderer: Renderer | None = None
+        self.watcher: Callable[[], None] | None = None  # called after every control period, to film what happens
         self._base_qpos = self._qpos("base")[0]
         self._arm_qpos, self._arm_ctrl = self._qpos(*_JOINTS), self._ctrl(*_JOINTS)
         self._wheel_qpos, self._wheel_ctrl = self._qpos(*_WHEELS), self._ctrl(*_WHEELS)
@@ -130,6 +133,8 @@ class SimBody:
             mujoco.mj_step(self.model, self.data, nstep=self._substeps)
             if self._velocity.any():
                 self._bumper |= self._read_bumper()
+            if self.watcher is not None:
+                self.watcher()
         self.truth.check()
 
     def stop(self) -> None:

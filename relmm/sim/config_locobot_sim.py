@@ -18,14 +18,14 @@ class LocobotSimConfig(RobotConfig):
     Args:
         room: name of a registered room.
         num_objects: how many objects lie in it; None for the room's own number.
-        seed: where the objects lie and which way the robot looks at first.
+        seed: where the objects lie and which way the robot looks at first; None for that of the command, or 0.
         camera: `paper` (the authors' simulated camera) or `d435` (a RealSense D435 on the LoCoBot's tower).
         depth: whether observations hold the depth picture too.
     """
 
     room: str = "no_obstacles"
     num_objects: int | None = None
-    seed: int = 0
+    seed: int | None = None
     camera: str = "paper"
     depth: bool = False
 

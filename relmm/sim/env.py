@@ -8,13 +8,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from relmm.features import ACTION_NAMES, FRONT, IMAGE_SIZE, MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES, Skill
+from relmm.features import ACTION_NAMES, FREE_GRASPS, FRONT, IMAGE_SIZE, MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES, Skill
 from relmm.sim.config_locobot_sim import LocobotSimConfig
-from relmm.sim.film import Film
+from relmm.sim.film import Scene
 from relmm.sim.locobot_sim import LocobotSim
 
 SUCCESS_SHARE = 0.9  # of the objects must be in the basket
-FREE_GRASPS = 2  # attempts after a navigation step that cost no step (N_grasp of the paper)
 _REACH = 1.0  # m; skill_x and skill_y lie within +-this
 
 
@@ -49,7 +48,7 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         # An upper bound on calls of `step`, which LeRobot asks for: each navigation step, its free grasps, a placement.
         self._max_episode_steps = navigation_steps * (2 + FREE_GRASPS)
         self.robot = LocobotSim(LocobotSimConfig(room=room, num_objects=num_objects, camera=camera))
-        self._film: Film | None = None
+        self._scene: Scene | None = None
         limit = np.array([MAX_X_VEL, MAX_THETA_VEL, max(Skill), _REACH, _REACH], np.float32)
         self.action_space = gym.spaces.Box(limit * [0, -1, 0, -1, -1], limit, (len(ACTION_NAMES),), np.float32)
         image = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
@@ -92,18 +91,18 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observe(), reward, terminated, self._steps >= self.navigation_steps and not terminated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The room from above with the robot's view in the corner, uint8 (480, 640, 3)."""
+        """The robot's view beside the room from above, uint8 (480, 840, 3)."""
         if self.render_mode != "rgb_array":
             return None
-        if self._film is None:
-            self._film = Film(self.robot.body)
-        return self._film.frame()
+        if self._scene is None:
+            self._scene = Scene(self.robot.body)
+        return self._scene.picture()
 
     def close(self) -> None:
         """Stop the robot and free the renderers."""
-        if self._film is not None:
-            self._film.close()
-            self._film = None
+        if self._scene is not None:
+            self._scene.close()
+            self._scene = None
         self.robot.disconnect()
 
     def _observe(self) -> dict[str, Any]:
@@ -112,7 +111,7 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return {"pixels": {FRONT: observation[FRONT]}, "agent_pos": state}
 
     def _info(self) -> dict[str, Any]:
-        truth, total = self.robot.body.truth, self.robot.body.room.num_objects
+        truth, total, state = self.robot.body.truth, self.robot.body.room.num_objects, self.robot.body.state()
         collected = len(truth.in_basket())
         return {
             "is_success": collected >= SUCCESS_SHARE * total,
@@ -123,5 +122,6 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "grasp_attempts": self._attempts,
             "grasp_successes": self._true_successes,
             "grasp_successes_judged": self._judged,
-            "robot_seconds": self.robot.body.state().time,
+            "robot_seconds": state.time,
+            "metres_driven": state.travelled,
         }

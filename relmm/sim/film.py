@@ -1,6 +1,11 @@
-"""Pictures for people: the room from above with the robot's own view in the corner."""
+"""Pictures for people: the robot's own view beside the room from above, and videos of them."""
 
 from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import cv2
 import numpy as np
@@ -9,12 +14,13 @@ from numpy.typing import NDArray
 from relmm.sim.body import SimBody
 from relmm.sim.renderer import Renderer, overview_camera
 
-SIZE = (640, 480)  # pixels
-_INSET = 150  # pixels, side of the robot's view
-_BORDER = 2
+_ROOM_SIZE = (640, 480)  # pixels
+_VIEW = 200  # pixels, side of the robot's own view, in a panel beside the room
+SIZE = (_ROOM_SIZE[0] + _VIEW, _ROOM_SIZE[1])
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-class Film:
+class Scene:
     """Looks at a simulated robot through a third-person camera.
 
     Args:
@@ -23,18 +29,63 @@ class Film:
 
     def __init__(self, body: SimBody) -> None:
         self._body = body
-        self._renderer = Renderer(body.model, overview_camera(body.room.size), SIZE)
-        self.frames: list[NDArray[np.uint8]] = []
+        self._renderer = Renderer(body.model, overview_camera(body.room.size), _ROOM_SIZE)
 
-    def frame(self) -> NDArray[np.uint8]:
-        """One picture, uint8 (480, 640, 3)."""
-        picture, _ = self._renderer.render(self._body.data)
-        rgb, _ = self._body.capture()
-        view = cv2.resize(rgb, (_INSET, _INSET), interpolation=cv2.INTER_NEAREST)
-        view = cv2.copyMakeBorder(view, *(_BORDER,) * 4, cv2.BORDER_CONSTANT, value=(255, 255, 255))
-        picture[8 : 8 + view.shape[0], 8 : 8 + view.shape[1]] = view
-        return picture
+    def picture(self, caption: str = "") -> NDArray[np.uint8]:
+        """The robot's view and the room now, uint8 (480, 840, 3), with a caption of lines."""
+        panel = np.full((SIZE[1], _VIEW, 3), 24, np.uint8)
+        panel[:_VIEW] = cv2.resize(self._body.capture()[0], (_VIEW, _VIEW), interpolation=cv2.INTER_NEAREST)
+        for row, line in enumerate(caption.split("\n")):
+            place = (10, _VIEW + 30 + 26 * row)
+            cv2.putText(panel, line, place, _FONT, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
+        return np.hstack([panel, self._renderer.render(self._body.data)[0]])
 
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
+
+
+class Film:
+    """An mp4 of a simulated robot's life, arm motions included.
+
+    Args:
+        body: what to film.
+        path: of the mp4.
+        period: simulated seconds between pictures.
+        fps: pictures per second when it is played; 1 / (period * fps) is slow motion, its inverse time lapse.
+    """
+
+    def __init__(self, body: SimBody, path: Path, period: float = 0.2, fps: int = 20) -> None:
+        import av
+
+        self._body, self._period = body, period
+        self._scene = Scene(body)
+        self._next = 0.0
+        self.caption = ""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._container = av.open(str(path), mode="w")
+        self._stream = self._container.add_stream("libx264", rate=Fraction(fps), options={"crf": "23"})
+        self._stream.width, self._stream.height, self._stream.pix_fmt = *SIZE, "yuv420p"
+
+    def _watch(self) -> None:
+        if self._body.data.time >= self._next:
+            self._next = self._body.data.time + self._period
+            self._encode(self._scene.picture(self.caption))
+
+    def _encode(self, picture: NDArray[np.uint8]) -> None:
+        import av
+
+        self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+
+    def __enter__(self) -> Self:
+        self._next = self._body.data.time
+        self._body.watcher = self._watch
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._body.watcher = None
+        self._container.mux(self._stream.encode())
+        self._container.close()
+        self._scene.close()

@@ -7,13 +7,14 @@ import ctypes
 import importlib
 import os
 import sys
+import warnings
 from functools import lru_cache
 from typing import Any
 
 from relmm.errors import RenderingError
 
 _LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
-_ADVICE = "install one with: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6, then set MUJOCO_GL=osmesa)"
+_ADVICE = "install a driver for rendering without a display with: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6, and set MUJOCO_GL=osmesa)"
 
 
 def choose_backend() -> str:
@@ -36,6 +37,20 @@ def choose_backend() -> str:
     raise RenderingError(f"No OpenGL library was found for rendering without a display: {_ADVICE}.")
 
 
+def import_mujoco() -> None:
+    """Import MuJoCo without the OpenGL backend of `MUJOCO_GL`: `gl_context` loads that, and can say why it fails."""
+    wanted = os.environ.pop("MUJOCO_GL", None)
+    importlib.import_module("mujoco")
+    if wanted is not None:
+        os.environ["MUJOCO_GL"] = wanted
+
+
+def not_working(backend: str, error: Exception) -> RenderingError:
+    """The error that says why rendering fails and what to install."""
+    reason = str(error).split(". ")[0].split("\n")[0] or type(error).__name__
+    return RenderingError(f"OpenGL through {backend} does not work here ({reason}): {_ADVICE}.")
+
+
 @lru_cache(maxsize=1)
 def gl_context() -> Any:
     """The process's OpenGL context, made at the first call. `make_current()` it before use.
@@ -47,10 +62,10 @@ def gl_context() -> Any:
     os.environ.setdefault("LP_NUM_THREADS", "0")
     backend = choose_backend()
     try:
-        context = importlib.import_module(f"mujoco.{backend}").GLContext(64, 64)
-        context.make_current()
+        with warnings.catch_warnings(action="ignore"):  # glfw warns, and goes on, where there is no display
+            context = importlib.import_module(f"mujoco.{backend}").GLContext(64, 64)
+            context.make_current()
     except Exception as error:  # drivers raise anything, from ImportError to bare OpenGL errors
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise RenderingError(f"OpenGL through {backend} does not work here ({reason}): {_ADVICE}.") from error
+        raise not_working(backend, error) from error
     atexit.register(context.free)
     return context

@@ -17,13 +17,13 @@ class LocobotSim(LocobotRobot):
     name = "locobot_sim"
 
     def __init__(self, config: LocobotSimConfig) -> None:
-        super().__init__(config, depth=config.depth, seed=config.seed)
+        super().__init__(config, depth=config.depth, seed=config.seed or 0)
         self.config = config
 
     def make_body(self) -> SimBody:
         """Build the room and put the robot into it."""
         body = SimBody(self.config.make_room(), camera_geometry(self.config.camera))
-        body.reset(np.random.default_rng(self.config.seed))
+        body.reset(np.random.default_rng(self.config.seed or 0))
         return body
 
     @property

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from relmm.sim.gl import gl_context
+from relmm.sim.gl import choose_backend, gl_context, not_working
 
 _MAX_GEOMS = 2000
 
@@ -24,7 +24,10 @@ class Renderer:
         self._gl = gl_context()
         self._gl.make_current()
         self._model = model
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except mujoco.FatalError as error:  # the context was made, but without a display it is not usable
+            raise not_working(choose_backend(), error) from error
         self._scene = mujoco.MjvScene(model, _MAX_GEOMS)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
             self._scene.flags[flag] = False

@@ -3,29 +3,36 @@
 import os
 import resource
 import signal
+import time
 
-from episode_helpers import REPO_ID, record
+from episode_helpers import REPO_ID, TASK, arguments, length_of, record
 
-from relmm.episodes import DurableDataset
+from relmm.episodes import DurableDataset, EpisodeRecorder
 from relmm.errors import DatasetError
 
 
-def die_at_rename(root, saved, number, before):
-    """Save two more episodes, and be killed at a rename of the second."""
+def die_after_renames(root, saved, done):
+    """Save two more episodes, and be killed in the second after `done` of its renames."""
     with DurableDataset.open(root, REPO_ID) as dataset:
         record(dataset, range(saved, saved + 1))
         replace, calls = os.replace, []
 
-        def replace_and_die(source, target):
+        def counted(source, target):
+            if len(calls) == done:
+                os.kill(os.getpid(), signal.SIGKILL)
             calls.append(target)
-            if len(calls) == number and before:
-                os.kill(os.getpid(), signal.SIGKILL)
             replace(source, target)
-            if len(calls) == number:
-                os.kill(os.getpid(), signal.SIGKILL)
 
-        os.replace = replace_and_die
+        os.replace = counted
         record(dataset, range(saved + 1, saved + 2))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def record_until_killed(root, acknowledgements):
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        while True:
+            acknowledgements.send(dataset.episodes)
+            record(dataset, range(dataset.episodes, dataset.episodes + 1))
 
 
 def die_in_first_save(root):
@@ -41,6 +48,22 @@ def fill_limited_files(root, allowed):
         try:
             record(dataset, range(1, 2))
         except DatasetError as error:
-            assert "cannot be written (" in str(error), error
-            assert "1 episodes are saved and whole" in str(error), error
-            os._exit(7)
+            sentence = str(error)
+    if "cannot be written (" in sentence and "1 episodes are saved and whole" in sentence:
+        os._exit(7)
+
+
+def hand_over_and_be_killed(root, episodes):
+    """Die with all these episodes handed over to the writer, but not yet saved, and one unfinished."""
+    settings = {"depth": False, "robot_type": "locobot_sim", "info": {}}
+    recorder = EpisodeRecorder(root, REPO_ID, resume=True, **settings)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    for episode in range(1, 1 + episodes):
+        for step in range(length_of(episode)):
+            recorder.add_frame(*arguments(episode, step), TASK)
+        recorder.save_episode()
+    recorder.add_frame(*arguments(99, 0), TASK)
+    os.kill(recorder._process.pid, signal.SIGCONT)
+    while recorder._queue.qsize():
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -1,14 +1,23 @@
 """Every saved episode survives SIGKILL at every step of a save."""
 
+import contextlib
 import csv
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
-from episode_children import die_at_rename, die_in_first_save, fill_limited_files
+from episode_children import (
+    die_after_renames,
+    die_in_first_save,
+    fill_limited_files,
+    hand_over_and_be_killed,
+    record_until_killed,
+)
 from episode_helpers import REPO_ID, TASK, arguments, check_dataset, length_of, load, new_dataset, record
 
 from relmm.episodes import DurableDataset, EpisodeRecorder, summarize
@@ -25,22 +34,42 @@ def run(forkserver, function, *arguments):
 
 
 # An episode of a known task is published by four renames: data, meta/episodes, stats, info.
-@pytest.mark.parametrize("number", [1, 2, 3, 4])
-@pytest.mark.parametrize("before", [True, False])
-def test_killed_between_the_renames_of_a_save(tmp_path, forkserver, number, before):
+@pytest.mark.parametrize(("done", "whole"), [(0, 2), (1, 2), (2, 3), (3, 3), (4, 3)])
+def test_killed_between_the_renames_of_a_save(tmp_path, forkserver, done, whole):
     root = tmp_path / "d"
     new_dataset(root, 1)
-    assert run(forkserver, die_at_rename, root, 1, number, before) == -signal.SIGKILL
+    assert run(forkserver, die_after_renames, root, 1, done) == -signal.SIGKILL
     stock = load(root)  # as it is, without a repair
     assert stock.num_episodes >= 2
     assert {int(index) for index in stock.hf_dataset["episode_index"]} >= {0, 1}
     with DurableDataset.open(root, REPO_ID) as dataset:
-        saved = dataset.episodes
         # Once data and metadata of the episode are there, it is whole, even if nobody was told.
-        assert saved == (3 if number > 2 or (number == 2 and not before) else 2)
-        record(dataset, range(saved, saved + 1))
-    check_dataset(root, saved + 1)
-    assert summarize(root).episodes == saved + 1
+        assert dataset.episodes == whole
+        record(dataset, range(whole, whole + 1))
+    check_dataset(root, whole + 1)
+    assert summarize(root).episodes == whole + 1
+
+
+def test_killed_at_random_instants(tmp_path, forkserver):
+    root, random = tmp_path / "d", np.random.default_rng(11)
+    new_dataset(root, 1)
+    for _ in range(4):
+        receiver, sender = forkserver.Pipe(duplex=False)
+        process = forkserver.Process(target=record_until_killed, args=(root, sender))
+        process.start()
+        sender.close()
+        acknowledged = receiver.recv()
+        time.sleep(random.uniform(0.0, 0.6))
+        process.kill()
+        process.join()
+        with contextlib.suppress(EOFError):
+            while True:
+                acknowledged = receiver.recv()
+        assert load(root).num_episodes >= acknowledged
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        assert dataset.episodes >= acknowledged
+        record(dataset, range(dataset.episodes, dataset.episodes + 1))
+    check_dataset(root, dataset.episodes)
 
 
 def test_killed_in_the_first_save(tmp_path, forkserver):
@@ -52,7 +81,7 @@ def test_killed_in_the_first_save(tmp_path, forkserver):
     check_dataset(root, 2)
 
 
-@pytest.mark.parametrize("allowed", [2_000, 20_000, 100_000])
+@pytest.mark.parametrize("allowed", [2_000, 100_000])
 def test_a_refused_write_leaves_the_earlier_episodes_whole(tmp_path, forkserver, allowed):
     root = tmp_path / "d"
     new_dataset(root, 1)
@@ -78,7 +107,8 @@ def test_a_full_disk(small_disk):
     root = small_disk / "d"
     settings = {"depth": False, "robot_type": "locobot_sim", "info": {}}
     recorder = EpisodeRecorder(root, REPO_ID, resume=False, **settings)
-    with pytest.raises(DatasetError, match=r"No space left on device.*episodes are saved and whole"), recorder:
+    message = r"No space left on device.*episodes are saved and whole"
+    with pytest.raises(DatasetError, match=message), recorder:  # noqa: PT012
         for episode in range(1000):
             for step in range(length_of(episode)):
                 recorder.add_frame(*arguments(episode, step), TASK)
@@ -87,15 +117,26 @@ def test_a_full_disk(small_disk):
     check_dataset(root, recorder.saved_episodes)
 
 
-def test_random_kills_of_a_whole_recording(tmp_path):
-    """A few rounds of the benchmark; it kills recorder and writer at once."""
+def test_the_writer_outlives_a_killed_recording(tmp_path, forkserver):
+    root = tmp_path / "d"
+    new_dataset(root, 1)
+    assert run(forkserver, hand_over_and_be_killed, root, 3) == -signal.SIGKILL
+    deadline = time.monotonic() + 20
+    while (root / "images").exists():  # the lock of the writer is in there until it ends
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    check_dataset(root, 4)
+
+
+@pytest.mark.slow
+def test_kills_of_a_whole_recording(tmp_path):
+    """A few rounds of the benchmark: it kills recorder and writer at once."""
     table = tmp_path / "kills.csv"
     script = PROJECT / "benchmarks" / "kill_recording.py"
-    command = [sys.executable, str(script), "--kills", "2", "--seed", "5", "--output", str(table)]
+    command = [sys.executable, str(script), "--kills", "3", "--seed", "5", "--output", str(table)]
     result = subprocess.run(
         command, env=os.environ | {"PYTHONPATH": str(PROJECT)}, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stdout + result.stderr
     rows = list(csv.DictReader(table.open()))
-    assert len(rows) == 2
-    assert all(int(row["unreadable"]) == 0 for row in rows)
+    assert [row["unreadable"] for row in rows] == ["0"] * 3

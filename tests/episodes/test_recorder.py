@@ -61,7 +61,7 @@ def test_a_killed_writer_is_reported_and_the_saved_episodes_are_whole(tmp_path):
     recorder.save_episode()
     recorder.flush()
     os.kill(recorder._process.pid, signal.SIGKILL)
-    with pytest.raises(DatasetError, match="the 1 episodes saved so far are whole"):
+    with pytest.raises(DatasetError, match="the 1 episodes saved so far are whole"):  # noqa: PT012
         for _ in range(1000):
             add_episode(recorder, 1)
     with pytest.raises(DatasetError, match="are whole"):

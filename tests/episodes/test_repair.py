@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from episode_helpers import REPO_ID, TASK, arguments, check_dataset, length_of, new_dataset, record
+from episode_helpers import REPO_ID, TASK, arguments, check_dataset, length_of, load, new_dataset, record
 
 from relmm.episodes import DurableDataset, FrameBuilder, verify_and_repair
 from relmm.errors import DatasetError
@@ -53,9 +53,14 @@ def test_a_whole_dataset_is_left_alone(root):
     assert snapshot(root) == before
 
 
-@pytest.mark.parametrize("damage", [truncate, empty, remove])
-@pytest.mark.parametrize("file", [DATA, META])
-@pytest.mark.parametrize("episode", [3, 1])
+@pytest.mark.parametrize(
+    ("damage", "file", "episode"),
+    [
+        *[(damage, file, 3) for damage in (truncate, empty, remove) for file in (DATA, META)],
+        (remove, DATA, 1),
+        (remove, META, 1),
+    ],
+)
 def test_the_episodes_before_a_damaged_file_are_kept(root, damage, file, episode):
     damage(root / file.format(episode))
     report = verify_and_repair(root)
@@ -84,7 +89,7 @@ def test_a_repaired_dataset_is_continued(root):
     check_dataset(root, 5)
 
 
-@pytest.mark.parametrize("damage", [truncate, empty, remove])
+@pytest.mark.parametrize("damage", [truncate, remove])
 @pytest.mark.parametrize("name", ["info.json", "stats.json", "tasks.parquet"])
 def test_other_metadata_is_rebuilt(root, healthy, damage, name):
     damage(root / "meta" / name)
@@ -106,8 +111,6 @@ def test_several_tasks_are_rebuilt_in_their_order(tmp_path):
         dataset.save_episode()
     remove(tmp_path / "d/meta/tasks.parquet")
     assert verify_and_repair(tmp_path / "d").episodes == 1
-    from episode_helpers import load
-
     loaded = load(tmp_path / "d")
     assert [loaded[i]["task"] for i in range(4)] == ["c", "a", "b", "a"]
 

@@ -72,9 +72,7 @@ def test_the_files_are_what_lerobot_writes(tmp_path, depth):
     # The stock metadata also has a fingerprint, the key of a cache of `datasets`.
     ours, stock = (json.loads(schema.metadata[b"huggingface"])["info"] for schema in (ours, stock))
     assert ours == stock
-    ours, stock = (
-        pq.read_schema(tmp_path / d / "meta/episodes/chunk-000/file-000.parquet") for d in ("ours", "stock")
-    )
+    ours, stock = (pq.read_schema(tmp_path / d / "meta/episodes/chunk-000/file-000.parquet") for d in ("ours", "stock"))
     assert ours == stock
     table = pq.read_table(tmp_path / "stock/data/chunk-000/file-000.parquet")
     first = pq.read_table(tmp_path / "ours/data/chunk-000/file-000.parquet")
@@ -233,9 +231,8 @@ def test_folders_that_are_no_dataset_are_refused(tmp_path):
 
 def test_two_writers_are_refused(tmp_path):
     new_dataset(tmp_path / "d", 1)
-    with DurableDataset.open(tmp_path / "d", REPO_ID):
-        with pytest.raises(DatasetError, match="one writer at a time"):
-            DurableDataset.open(tmp_path / "d", REPO_ID)
+    with DurableDataset.open(tmp_path / "d", REPO_ID), pytest.raises(DatasetError, match="one writer at a time"):
+        DurableDataset.open(tmp_path / "d", REPO_ID)
     DurableDataset.open(tmp_path / "d", REPO_ID).close()
 
 

@@ -1,0 +1,1 @@
+"""relmm-record, relmm-eval and relmm-doctor: parse, wire together, nothing else."""

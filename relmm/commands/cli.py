@@ -1,0 +1,127 @@
+"""What the commands share: parsing as LeRobot does, errors in one sentence, stopping on signals."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import logging
+import os
+import signal
+import sys
+import types
+import warnings
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
+
+import draccus
+from tqdm import tqdm
+
+from relmm.errors import ConfigError, RelmmError
+
+Config = TypeVar("Config")
+_USAGE_ERROR = 2
+
+
+def run(command: str, config_class: type[Config], job: Callable[[Config], None]) -> None:
+    """Parse the command line into a config, do the job, and end with a sentence instead of a traceback.
+
+    Args:
+        command: its name, for messages.
+        config_class: a draccus dataclass; `--policy.path` is understood as in LeRobot.
+        job: what to do.
+    """
+    _quiet()
+    try:
+        _register_plugins()
+        job(_parse(config_class))
+    except (RelmmError, OSError) as error:
+        print(f"{command}: {_sentence(error)}", file=sys.stderr)
+        sys.exit(_USAGE_ERROR)
+
+
+def _register_plugins() -> None:
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    import relmm.plugin  # noqa: F401
+
+    register_third_party_plugins()
+
+
+def _parse(config_class: type[Config]) -> Config:
+    """The command line as LeRobot parses it.
+
+    Raises:
+        ConfigError: it cannot be understood, or one of our own checks failed.
+    """
+    from lerobot.configs import parser
+
+    def identity(config: Any) -> Any:
+        return config
+
+    identity.__annotations__["config"] = config_class  # where the parser looks for the class
+    messages = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(messages):
+            return parser.wrap()(identity)()  # type: ignore[no-any-return]
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        # The parser has printed its usage and an error; draccus hides our own checks' words among the causes.
+        last_line = messages.getvalue().strip().split("\n")[-1].split("error: ", 1)[-1]
+        raise _own_error(stop) or ConfigError(f"{last_line} (--help shows what there is).") from stop
+    except (draccus.utils.DraccusException, argparse.ArgumentError) as error:
+        raise _own_error(error) or ConfigError(_sentence(error)) from error
+
+
+def _quiet() -> None:
+    """Only our own words on the terminal; warnings of other libraries that a user can do nothing about are left out."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    logging.getLogger("lerobot").setLevel(logging.ERROR)
+    logging.getLogger().setLevel(logging.ERROR)
+    logging.getLogger("relmm").setLevel(logging.INFO)
+    warnings.filterwarnings("ignore", module="(torch|torchvision|datasets|gymnasium).*")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads cost more than they give on few cores
+
+
+def _own_error(error: BaseException | None) -> RelmmError | None:
+    """Ours among the causes of an error: draccus wraps what a config's checks raise."""
+    while error is not None and not isinstance(error, RelmmError):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _sentence(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def progress(total: int, unit: str, title: str | None = None, leave: bool = True) -> tqdm[NoReturn]:
+    """A progress bar; where nobody watches, as in a log file, it says something every ten seconds only."""
+    interval = 0.1 if sys.stderr.isatty() else 10.0
+    return tqdm(total=total, unit=unit, desc=title, leave=leave, mininterval=interval, dynamic_ncols=True)
+
+
+class StopOnSignal:
+    """Notes the first SIGINT or SIGTERM instead of dying of it; a second one ends the process as usual."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> StopOnSignal:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._restore()
+
+    def _note(self, number: int, frame: types.FrameType | None) -> None:
+        self.stopped = True
+        self._restore()
+        print("\nStopping: saving what there is (once more to stop at once).", file=sys.stderr)
+
+    def _restore(self) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous.clear()

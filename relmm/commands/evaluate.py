@@ -1,0 +1,208 @@
+"""relmm-eval: how much of a room does a policy clean? Same episodes as lerobot-eval, more to see."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+
+from relmm.commands.cli import progress, run
+from relmm.commands.policies import make_actor, policy_from_path, take_seed
+from relmm.errors import ConfigError
+from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES
+from relmm.learning.actor import Actor
+from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
+from relmm.sim.env import SUCCESS_SHARE, RelmmRoomEnv
+from relmm.sim.film import Film
+
+_COLUMNS = ("collected", "picked up", "grasps", "grasp success", "steps/object", "s/object", "metres")
+
+
+@dataclass
+class EvalSettings:
+    """How to evaluate.
+
+    Args:
+        n_episodes: episodes, of the seeds `seed`, `seed` + 1, ...
+        n_videos: how many of them to film, from the first on.
+    """
+
+    n_episodes: int = 10
+    n_videos: int = 1
+
+    def __post_init__(self) -> None:
+        if self.n_episodes < 1:
+            raise ConfigError(f"eval.n_episodes is {self.n_episodes}, but must be at least 1.")
+        if self.n_videos < 0:
+            raise ConfigError(f"eval.n_videos is {self.n_videos}, but must not be negative.")
+
+
+@dataclass
+class EvalConfig:
+    """Evaluate a policy in a simulated room.
+
+    Args:
+        env: `--env.type=relmm_room --env.room=...`.
+        policy: who acts.
+        eval: how many episodes and videos.
+        output_dir: a folder that does not exist yet; None for outputs/eval/DATE/TIME_ROOM_POLICY, as lerobot-eval.
+        seed: of the first episode; 1000 as in lerobot-eval.
+    """
+
+    env: EnvConfig = field(default_factory=RelmmRoomEnvConfig)
+    policy: PreTrainedConfig | None = None
+    eval: EvalSettings = field(default_factory=EvalSettings)
+    output_dir: Path | None = None
+    seed: int = 1000
+
+    def __post_init__(self) -> None:
+        self.policy = policy_from_path(self.policy)
+        if not isinstance(self.env, RelmmRoomEnvConfig):
+            raise ConfigError(f"relmm-eval needs --env.type=relmm_room, not {self.env.type}.")
+        if self.seed < 0:
+            raise ConfigError(f"seed is {self.seed}, but must not be negative.")
+        if self.output_dir is None:
+            now = datetime.now()
+            name = f"{now:%Y-%m-%d}/{now:%H-%M-%S}_{self.env.room}_{self.policy.type}"
+            self.output_dir = Path("outputs/eval") / name
+        if self.output_dir.exists():
+            raise ConfigError(f"{self.output_dir} exists already: choose another --output_dir.")
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """The fields that LeRobot's parser lets be loaded with `.path`."""
+        return ["policy"]
+
+
+@dataclass(frozen=True)
+class EpisodeScore:
+    """One episode.
+
+    Attributes:
+        seed: where the objects lay.
+        collected, total: objects in the basket at the end, of how many.
+        grasps, picked_up, picked_up_judged: attempts, those that lifted something, and those the robot believed did.
+        navigation_steps: taken.
+        seconds: on the robot's clock.
+        metres: driven, from the wheels' odometry.
+    """
+
+    seed: int
+    collected: int
+    total: int
+    grasps: int
+    picked_up: int
+    picked_up_judged: int
+    navigation_steps: int
+    seconds: float
+    metres: float
+
+    def row(self) -> list[float]:
+        """The values of `_COLUMNS`."""
+        objects = max(self.collected, 1)
+        share = self.picked_up / max(self.grasps, 1)
+        rates = (self.navigation_steps / objects, self.seconds / objects)
+        return [self.collected / self.total, self.picked_up, self.grasps, share, *rates, self.metres]
+
+
+def evaluate(config: EvalConfig) -> None:
+    """Run the episodes, print a table, and write `eval_info.json` and videos."""
+    assert isinstance(config.env, RelmmRoomEnvConfig) and config.policy is not None and config.output_dir is not None
+    take_seed(config.policy, 0)
+    actor = make_actor(config.policy)
+    env = RelmmRoomEnv(**{**config.env.gym_kwargs, "render_mode": None})
+    scores = []
+    try:
+        for index in range(config.eval.n_episodes):
+            filmed = index < config.eval.n_videos
+            video = config.output_dir / "videos" / f"eval_episode_{index}.mp4" if filmed else None
+            title = f"episode {index + 1}/{config.eval.n_episodes}"
+            scores.append(run_episode(env, actor, config.seed + index, title, video))
+    finally:
+        env.close()
+    print(table(scores))
+    _write(config, scores)
+
+
+def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: Path | None) -> EpisodeScore:
+    """One episode with a progress bar, and a film of it at four times its speed."""
+    observation, info = env.reset(seed=seed)
+    actor.reset()
+    film = Film(env.robot.body, video) if video is not None else None
+    with progress(env.navigation_steps, "step", title, leave=False) as bar, film or nullcontext():
+        ended = False
+        while not ended:
+            action = actor.act(_robot_observation(observation))
+            observation, _, terminated, truncated, info = env.step(np.array([action[n] for n in ACTION_NAMES]))
+            ended = terminated or truncated
+            if film is not None:
+                film.caption = _caption(info)
+            bar.set_postfix(collected=info["objects_collected"], grasps=info["grasp_attempts"], refresh=False)
+            bar.update(info["navigation_steps"] - bar.n)
+    return EpisodeScore(
+        seed=seed,
+        collected=info["objects_collected"],
+        total=info["objects_total"],
+        grasps=info["grasp_attempts"],
+        picked_up=info["grasp_successes"],
+        picked_up_judged=info["grasp_successes_judged"],
+        navigation_steps=info["navigation_steps"],
+        seconds=info["robot_seconds"],
+        metres=info["metres_driven"],
+    )
+
+
+def _caption(info: dict[str, Any]) -> str:
+    lines = (
+        f"{info['objects_collected']} of {info['objects_total']} collected",
+        f"step {info['navigation_steps']}",
+        f"{info['grasp_attempts']} grasps",
+        "4x speed",
+    )
+    return "\n".join(lines)
+
+
+def _robot_observation(observation: dict[str, Any]) -> dict[str, Any]:
+    state = dict(zip(STATE_NAMES, observation["agent_pos"].tolist(), strict=True))
+    return {**state, FRONT: observation["pixels"][FRONT]}
+
+
+def table(scores: list[EpisodeScore]) -> str:
+    """A row an episode, then mean and standard deviation."""
+    rows = np.array([score.row() for score in scores])
+    lines = ["  ".join(f"{name:>13}" for name in ("seed", *_COLUMNS))]
+    labels = [*(str(score.seed) for score in scores), "mean", "std"]
+    for label, row in zip(labels, [*rows, rows.mean(axis=0), rows.std(axis=0)], strict=True):
+        values = [f"{row[0]:.1%}", f"{row[1]:.1f}", f"{row[2]:.1f}", f"{row[3]:.1%}", *(f"{v:.1f}" for v in row[4:])]
+        lines.append("  ".join(f"{value:>13}" for value in (label, *values)))
+    return "\n".join(lines)
+
+
+def _write(config: EvalConfig, scores: list[EpisodeScore]) -> None:
+    assert config.output_dir is not None
+    config.output_dir.mkdir(parents=True, exist_ok=True)
+    share = np.array([score.collected / score.total for score in scores])
+    overall = {"mean_share_collected": share.mean(), "std_share_collected": share.std(), "n_episodes": len(scores)}
+    overall["pc_success"] = 100 * float(np.mean(share >= SUCCESS_SHARE))
+    overall["avg_sum_reward"] = float(np.mean([score.picked_up_judged for score in scores]))
+    info = {"overall": overall, "per_episode": [asdict(score) for score in scores]}
+    (config.output_dir / "eval_info.json").write_text(json.dumps(info, indent=2))
+    print(f"\ncollected {share.mean():.1%} of the objects (std {share.std():.1%}); details in {config.output_dir}")
+    for video in sorted(config.output_dir.glob("videos/*.mp4")):
+        print(f"video: {video}")
+
+
+def main() -> None:
+    """Entry point of `relmm-eval`."""
+    run("relmm-eval", EvalConfig, evaluate)
+
+
+if __name__ == "__main__":
+    main()

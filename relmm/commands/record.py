@@ -1,0 +1,156 @@
+"""relmm-record: a robot acts by a policy, and its life becomes a LeRobot dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.robots.config import RobotConfig
+
+from relmm.commands.cli import StopOnSignal, progress, run
+from relmm.commands.policies import make_actor, policy_from_path, take_seed
+from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, summarize
+from relmm.errors import ConfigError
+from relmm.learning.actor import Actor
+from relmm.learning.collect import Collector
+from relmm.robot.locobot import LocobotRobot
+
+_COLLECTOR_STREAM = 2  # keeps the pseudo-resets' random numbers apart from others drawn from the same seed
+
+
+@dataclass
+class RecordDatasetConfig:
+    """Where the episodes go.
+
+    Args:
+        repo_id: name of the dataset, `user/name`.
+        root: its folder; None for LeRobot's own place for datasets of that name.
+        num_episodes: how many to record in this run.
+    """
+
+    repo_id: str
+    root: Path | None = None
+    num_episodes: int = 10
+
+    def __post_init__(self) -> None:
+        check_repo_id(self.repo_id)
+        if self.num_episodes < 1:
+            raise ConfigError(f"dataset.num_episodes is {self.num_episodes}, but must be at least 1.")
+
+    def folder(self) -> Path:
+        """The dataset's folder."""
+        from lerobot.utils.constants import HF_LEROBOT_HOME
+
+        return self.root or HF_LEROBOT_HOME / self.repo_id
+
+
+@dataclass
+class RecordConfig:
+    """Record a robot's life as a LeRobot dataset.
+
+    Args:
+        robot: `--robot.type=locobot_sim --robot.room=...`.
+        dataset: where the episodes go.
+        policy: who acts.
+        seed: of everything random; the same seed records the same dataset.
+        resume: continue the dataset in its folder.
+        max_steps: navigation steps after which an episode is cut off.
+        pseudo_reset_steps: random navigation steps before and after a picked-up object is put down again.
+    """
+
+    robot: RobotConfig
+    dataset: RecordDatasetConfig
+    policy: PreTrainedConfig | None = None
+    seed: int = 0
+    resume: bool = False
+    max_steps: int = 250
+    pseudo_reset_steps: int = 20
+
+    def __post_init__(self) -> None:
+        self.policy = policy_from_path(self.policy)
+        if self.seed < 0:
+            raise ConfigError(f"seed is {self.seed}, but must not be negative.")
+        if self.max_steps < 1:
+            raise ConfigError(f"max_steps is {self.max_steps}, but must be at least 1.")
+        if self.pseudo_reset_steps < 0:
+            raise ConfigError(f"pseudo_reset_steps is {self.pseudo_reset_steps}, but must not be negative.")
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """The fields that LeRobot's parser lets be loaded with `.path`."""
+        return ["policy"]
+
+
+def record(config: RecordConfig) -> None:
+    """Record `num_episodes` episodes, and say what the dataset then holds."""
+    from lerobot.robots.utils import make_robot_from_config
+
+    root = config.dataset.folder()
+    if not config.resume:
+        check_new(root, config.dataset.repo_id)
+    # A resumed recording goes on with other random numbers than it began with.
+    seed = config.seed + (summarize(root).episodes if config.resume and root.exists() else 0)
+    take_seed(config.robot, seed)
+    take_seed(config.policy, seed)
+    actor = make_actor(config.policy)
+    robot = make_robot_from_config(config.robot)
+    if not isinstance(robot, LocobotRobot):
+        raise ConfigError(f"relmm-record needs a LoCoBot, not {config.robot.type!r}: say --robot.type=locobot_sim.")
+    with StopOnSignal() as signals, robot:
+        robot.get_observation()  # a robot that cannot see fails here, before anything is written
+        with _recorder(config, root, robot) as recorder:
+            _collect(config, robot, actor, recorder, seed, signals)
+    print(summarize(root))
+
+
+def _recorder(config: RecordConfig, root: Path, robot: LocobotRobot) -> EpisodeRecorder:
+    settings = config.robot
+    info = {key: getattr(settings, key) for key in ("room", "num_objects", "camera", "seed") if hasattr(settings, key)}
+    return EpisodeRecorder(
+        root,
+        config.dataset.repo_id,
+        resume=config.resume,
+        depth="front_depth" in robot.observation_features,
+        robot_type=robot.name,
+        info={**info, "policy": config.policy.type, "policy_path": str(config.policy.pretrained_path or "")},
+    )
+
+
+def _collect(
+    config: RecordConfig,
+    robot: LocobotRobot,
+    actor: Actor,
+    recorder: EpisodeRecorder,
+    seed: int,
+    signals: StopOnSignal,
+) -> None:
+    if recorder.repaired:
+        print(recorder.repaired)
+    collector = Collector(
+        robot,
+        actor,
+        recorder,
+        clock=robot.seconds,
+        rng=np.random.default_rng([seed, _COLLECTOR_STREAM]),
+        max_steps=config.max_steps,
+        pseudo_reset_steps=config.pseudo_reset_steps,
+        should_stop=lambda: signals.stopped,
+    )
+    frames = successes = grasps = 0
+    with progress(config.dataset.num_episodes, "episode") as bar:
+        while bar.n < config.dataset.num_episodes and not signals.stopped:
+            result = collector.episode()
+            frames, grasps, successes = frames + result.frames, grasps + result.grasps, successes + result.success
+            bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, refresh=False)
+            bar.update()
+
+
+def main() -> None:
+    """Entry point of `relmm-record`."""
+    run("relmm-record", RecordConfig, record)
+
+
+if __name__ == "__main__":
+    main()
