@@ -428,7 +428,8 @@ class Controller:
         """Steps that being at each pose (n, 3) is worth avoiding: too near a wall, on an object, facing an obstacle."""
         pushed = np.sum(np.linalg.norm(objects - poses[:, None, :2], axis=-1) < PUSH_RADIUS, axis=1)
         tight = np.maximum(TIGHT - self._map.clearance(poses[:, :2]), 0.0)
-        return 1.5 * pushed + 60.0 * tight + 3.0 * self._facing(poses[:, :2], poses[:, 2])
+        # Less than what a step gains, or standing still would look best.
+        return 0.6 * pushed + 60.0 * tight + 0.4 * self._facing(poses[:, :2], poses[:, 2])
 
     def _facing(self, places: FloatArray, headings: FloatArray) -> NDArray[np.bool_]:
         """Where the robot would see an obstacle so near that it turned away of itself."""

@@ -154,10 +154,11 @@ def run(room: str, steps: int, seed: int) -> list[dict[str, Any]]:
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Print a table."""
-    print(f"{'task':<12}{'count':>7}{'per s':>8}{'physics':>10}{'rendering':>11}{'rest':>9}{'core':>7}{'avoidance turns':>17}")
+    columns = ("task", "count", "per_second", "physics_ms", "rendering_ms", "rest_ms", "core_share", "avoidance_turns")
+    print("".join(f"{column:>16}" for column in columns))
     for row in rows:
-        parts = f"{row['physics_ms']:>7.2f} ms{row['rendering_ms']:>8.2f} ms{row['rest_ms']:>6.2f} ms{row['core_share']:>7.0%}"
-        print(f"{row['task']:<12}{row['count']:>7}{row['per_second']:>8.1f}{parts}{row['avoidance_turns']:>17}")
+        values = (f"{row[c]:.2f}" if isinstance(row[c], float) else str(row[c]) for c in columns)
+        print("".join(f"{value:>16}" for value in values))
 
 
 def save(rows: list[dict[str, Any]], path: Path) -> None:

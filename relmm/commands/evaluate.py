@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
@@ -49,14 +50,14 @@ class EvalConfig:
     """Evaluate a policy in a simulated room.
 
     Args:
-        env: `--env.type=relmm_room --env.room=...`.
+        env: `--env.room=...`.
         policy: who acts.
         eval: how many episodes and videos.
         output_dir: a folder that does not exist yet; None for outputs/eval/DATE/TIME_ROOM_POLICY, as lerobot-eval.
         seed: of the first episode; 1000 as in lerobot-eval.
     """
 
-    env: EnvConfig = field(default_factory=RelmmRoomEnvConfig)
+    env: EnvConfig
     policy: PreTrainedConfig | None = None
     eval: EvalSettings = field(default_factory=EvalSettings)
     output_dir: Path | None = None
@@ -200,7 +201,9 @@ def _write(config: EvalConfig, scores: list[EpisodeScore]) -> None:
 
 
 def main() -> None:
-    """Entry point of `relmm-eval`."""
+    """Entry point of `relmm-eval`; there is only one environment, so its type need not be said."""
+    if not any(argument.startswith(("--env.type", "--config_path")) for argument in sys.argv):
+        sys.argv.append("--env.type=relmm_room")
     run("relmm-eval", EvalConfig, evaluate)
 
 

@@ -113,6 +113,7 @@ class EpisodeRecorder:
         Raises:
             DatasetError: there are no frames, or the writer has failed.
         """
+        self._check()
         if not self._frames:
             raise DatasetError("an episode without frames cannot be saved; add a frame first.")
         self._put(("save",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -30,6 +31,11 @@ class Actor:
     def reset(self) -> None:
         """Begin a new episode."""
         self._policy.reset()
+
+    def save_pretrained(self, folder: Path) -> None:
+        """Write a folder that LeRobot's `--policy.path` takes."""
+        for part in (self._policy, self._preprocessor, self._postprocessor):
+            part.save_pretrained(folder)
 
     def act(self, observation: dict[str, Any]) -> dict[str, float]:
         """The next action by name, for a robot's flat observation."""

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
+import gymnasium as gym
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import freeze_after_episode_end
 
 from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, FRONT, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 
 ENV_ID = "gym_relmm_room/Room-v0"
+if ENV_ID not in gym.registry:
+    gym.register(ENV_ID, entry_point="relmm.sim.env:RelmmRoomEnv")
+
+
+def _make_room(gym_kwargs: dict[str, Any]) -> gym.Env[Any, Any]:
+    """A room; defined here so that worker processes, which look it up by name, register the environment first."""
+    return gym.make(ENV_ID, disable_env_checker=True, **gym_kwargs)
 
 
 @EnvConfig.register_subclass("relmm_room")
@@ -47,6 +57,22 @@ class RelmmRoomEnvConfig(EnvConfig):
         if self.navigation_steps < 1:
             raise ConfigError(f"env.navigation_steps is {self.navigation_steps}, but must be at least 1.")
         LocobotSimConfig(room=self.room, num_objects=self.num_objects, camera=self.camera)
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """As LeRobot's own, but a room whose episode has ended stands still until the slowest one has.
+
+        Otherwise gymnasium starts its next episode at once, and the first reward of that one counts for the last.
+        """
+        make = freeze_after_episode_end(partial(_make_room, self.gym_kwargs))
+        mode = gym.vector.AutoresetMode.SAME_STEP
+        if use_async_envs and n_envs > 1:
+            # An OpenGL context does not survive a fork.
+            rooms = gym.vector.AsyncVectorEnv([make] * n_envs, autoreset_mode=mode, context="forkserver")
+        else:
+            rooms = gym.vector.SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
+        return {self.type: {0: rooms}}
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Recording behind the loop."""
 
 import os
+import resource
 import signal
 import time
 
@@ -19,6 +20,7 @@ def add_episode(recorder, episode, steps=None):
 
 
 def test_a_slow_writer_makes_the_loop_wait_and_loses_nothing(tmp_path):
+    """Then the disk refuses: that is told at the next call, and costs the unsaved episode only."""
     with EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, buffered_frames=4, **SETTINGS) as recorder:
         os.kill(recorder._process.pid, signal.SIGSTOP)
         started = time.monotonic()
@@ -32,9 +34,14 @@ def test_a_slow_writer_makes_the_loop_wait_and_loses_nothing(tmp_path):
         recorder.discard_episode()
         recorder.flush()
         assert recorder.saved_episodes == 12
-        add_episode(recorder, 12, steps=1)  # not asked to be saved
+        resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (1000, 1000))
+        add_episode(recorder, 12)
+        recorder.save_episode()
+        with pytest.raises(DatasetError, match=r"cannot be written \(.*12 episodes are saved and whole"):
+            recorder.flush()
     with pytest.raises(DatasetError, match="closed"):
         recorder.save_episode()
+    assert recorder.saved_episodes == 12
     check_dataset(tmp_path / "d", 12)
 
 
@@ -55,6 +62,7 @@ def test_the_unfinished_episode_is_saved_where_asked(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_killed_writer_is_reported_and_the_saved_episodes_are_whole(tmp_path):
     recorder = EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, **SETTINGS)
     add_episode(recorder, 0)

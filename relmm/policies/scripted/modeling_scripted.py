@@ -1,31 +1,77 @@
-"""The paper's scripted controller."""
+"""The paper's scripted controller: drive to the closest object, grasp it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL, MAX_X_VEL, FloatArray, Skill, action_dict, xy_to_cell
-from relmm.geometry import camera_geometry
+from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL, MAX_X_VEL, FloatArray, action_dict, xy_to_cell
+from relmm.geometry import CameraGeometry, camera_geometry
 from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
 from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
-from relmm.policies.scripted.vision import detect_objects
+from relmm.policies.scripted.vision import OBJECT_HEIGHT, detect_objects
 
-_AREA = ((0.305, 0.460), (-0.075, 0.075))  # m; a little inside the graspable area, because centroids err
-_AIM = 0.40  # m in front of the robot, where an object shall be after the approach
+_GRASP_AREA = np.array([[0.305, -0.075], [0.460, 0.075]])  # m; inside the graspable area by a centroid's error
+_AIM = 0.40  # m in front of the robot, where an approach ends
 _NEAREST = 0.31  # m; the robot cannot drive backwards, so nearer objects are out of reach
-_TURN_FIRST = 30.0  # degrees; beyond that, driving forward would lead past the object
-_SAME = 0.12  # m between an object and where it should be after a step
-_TRIED = 0.03  # m round a place that was grasped in vain
-_FORGET = 20  # steps until such a place is tried again
-_ROUND = 12  # steps that turn the robot far enough to have seen everything round it
-_LEG = (4, 12)  # steps of a straight leg
+_TURN_FIRST = 30.0  # degrees; driving forward beyond that would lead past the object
+_AHEAD = 15.0  # degrees either side, where the robot is known to have space after a detour
+
+_VIEW_MARGIN = 5  # pixels; objects cut by the picture's edge are not detected
+_SAME = 0.12  # m between an object and where it was expected; centroids at 2 m err by 4 cm and driving adds to it
+_TRIED_RADIUS, _TRIED_STEPS = 0.03, 20  # m and steps in which a place that was grasped in vain is left alone
+_STEP, _TURN = MAX_X_VEL * DRIVE_PULSE_S, MAX_THETA_VEL * DRIVE_PULSE_S  # m and degrees in a navigation step
+
+_LOOK_ROUND = int(np.ceil(360 / _TURN)) - 1  # steps; the first and the last view are 60 degrees wide
+_LEG = (4, 12)  # steps straight on after looking round in vain; 0.4 to 1.2 m
+_MAX_LEAVE = 6  # steps straight on after a detour
+
+
+@dataclass
+class _Memory:
+    """Places in the robot's present frame (m), and what the robot is up to."""
+
+    seen: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # objects, also those out of view by now
+    tried: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # x, y and the steps since
+    target: FloatArray | None = None
+    search: list[dict[str, float]] = field(default_factory=list)  # what remains of a search
+    leave: int = 0  # steps that remain to get away from what the robot turned away from
+    detours: int = 0  # since the last grasp
+
+    def look(self, found: FloatArray, camera: CameraGeometry) -> bool:
+        """Take in what is seen now; false if nothing is where it was expected, because the robot has turned."""
+        pixels = camera.project(np.column_stack([self.seen, np.full(len(self.seen), OBJECT_HEIGHT)]))
+        in_view = ((pixels > _VIEW_MARGIN) & (pixels < np.array(camera.size) - 1 - _VIEW_MARGIN)).all(axis=1)
+        again = (_distances(self.seen, found) < _SAME).any(axis=1)
+        as_expected = not in_view.any() or bool(again[in_view].any())
+        kept = self.seen[~in_view & ~again] if as_expected else np.zeros((0, 2))
+        self.seen = np.concatenate([found, kept])
+        return as_expected
+
+    def worth_trying(self) -> FloatArray:
+        """Objects that can be reached and were not grasped in vain lately, shape (n, 2), quickest to reach first."""
+        distance, angle = np.hypot(*self.seen.T), np.abs(np.degrees(np.arctan2(self.seen[:, 1], self.seen[:, 0])))
+        steps = distance / _STEP + np.maximum(angle - _TURN, 0) / _TURN
+        good = (distance >= _NEAREST) & (_distances(self.seen, self.tried[:, :2]) > _TRIED_RADIUS).all(axis=1)
+        return self.seen[good][np.argsort(steps[good])]
+
+    def move(self, action: dict[str, float]) -> None:
+        """Carry the places along with the robot through a navigation step."""
+        turn, forward = np.radians(action["theta.vel"]) * DRIVE_PULSE_S, action["x.vel"] * DRIVE_PULSE_S
+        shift = forward * np.array([np.cos(turn / 2), np.sin(turn / 2)])
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])  # p @ R turns p by -turn
+        self.seen = (self.seen - shift) @ rotation
+        self.tried[:, :2] = (self.tried[:, :2] - shift) @ rotation
+        self.tried[:, 2] += 1
+        self.tried = self.tried[self.tried[:, 2] < _TRIED_STEPS]
+        self.target = None if self.target is None else (self.target - shift) @ rotation
 
 
 class RelmmScriptedPolicy(ControllerPolicy):
-    """Drives to the closest object it sees and grasps it."""
+    """Drives to the closest object it has seen and grasps it; searches at random where there is none."""
 
     config_class = RelmmScriptedConfig
     name = "relmm_scripted"
@@ -37,76 +83,74 @@ class RelmmScriptedPolicy(ControllerPolicy):
 
     def decide(self, image: NDArray[np.uint8], row: Row) -> dict[str, float]:
         """See `ControllerPolicy.decide`."""
-        objects = _worth_trying(detect_objects(image, self._camera), row)
-        graspable = [point for point in objects if _in_area(point)]
-        if graspable and row.attempts < self.config.num_grasp:
-            return _grasp(graspable[0], row)
-        action = _approach(_choose(objects, row)) if len(objects) else _explore(row)
-        _move_memory(row, action)
+        memory: _Memory = row.memory.setdefault("scripted", _Memory())
+        if not memory.look(detect_objects(image, self._camera), self._camera):
+            _begin_leaving(memory, row.rng)
+        objects = memory.worth_trying()
+        graspable = objects[((objects >= _GRASP_AREA[0]) & (objects <= _GRASP_AREA[1])).all(axis=1)]
+        if len(graspable) and row.attempts < self.config.num_grasp:
+            return _grasp(graspable[0], memory)
+        action = _navigate(objects, memory, row.rng)
+        memory.move(action)
         return action
 
 
-def _in_area(point: FloatArray) -> bool:
-    return all(low <= value <= high for value, (low, high) in zip(point, _AREA, strict=True))
+def _distances(places: FloatArray, others: FloatArray) -> FloatArray:
+    """Between (n, 2) and (m, 2), shape (n, m)."""
+    return np.asarray(np.linalg.norm(places[:, None] - others, axis=-1))
 
 
-def _worth_trying(objects: FloatArray, row: Row) -> FloatArray:
-    objects = objects[np.hypot(*objects.T) >= _NEAREST]
-    for place, _ in row.memory.get("tried", []):
-        objects = objects[np.hypot(*(objects - place).T) > _TRIED]
-    return objects
+def _begin_leaving(memory: _Memory, rng: np.random.Generator) -> None:
+    """The robot has turned away from an obstacle: the same object would lead back to it, so first go on a little.
+
+    The more often that happens, the further.
+    """
+    memory.detours += 1
+    memory.target = None
+    memory.leave = int(rng.integers(1, 1 + min(1 + memory.detours, _MAX_LEAVE)))
 
 
-def _grasp(point: FloatArray, row: Row) -> dict[str, float]:
-    row.memory["tried"] = [*row.memory.get("tried", []), (point, 0)]
+def _grasp(point: FloatArray, memory: _Memory) -> dict[str, float]:
+    memory.target, memory.detours, memory.leave = None, 0, 0
+    memory.seen = np.zeros((0, 2))[:0] if len(memory.seen) == 0 else memory.seen[(memory.seen != point).any(axis=1)]
+    memory.tried = np.vstack([memory.tried, [*point, 0]])
     return grasp_cell(xy_to_cell(*point))
 
 
-def _choose(objects: FloatArray, row: Row) -> FloatArray:
-    expected = row.memory.get("target")
-    chosen: FloatArray = objects[0]
-    if expected is not None:
-        distance = np.hypot(*(objects - expected).T)
+def _navigate(objects: FloatArray, memory: _Memory, rng: np.random.Generator) -> dict[str, float]:
+    if memory.leave > 0:
+        memory.leave -= 1
+        objects = objects[np.abs(np.degrees(np.arctan2(objects[:, 1], objects[:, 0]))) < _AHEAD]
+        if len(objects) == 0:
+            return action_dict(x_vel=MAX_X_VEL)
+    if len(objects) == 0:
+        return _search(memory, rng)
+    memory.search = []
+    memory.target = _choose(objects, memory.target)
+    return _approach(memory.target)
+
+
+def _choose(objects: FloatArray, target: FloatArray | None) -> FloatArray:
+    """The object that the robot was on its way to, else the first one."""
+    if target is not None:
+        distance = np.linalg.norm(objects - target, axis=1)
         if distance.min() < _SAME:
-            chosen = objects[distance.argmin()]
-    row.memory["target"] = chosen
-    row.memory["searched"] = 0
-    return chosen
+            return objects[distance.argmin()]
+    return objects[0]
 
 
 def _approach(point: FloatArray) -> dict[str, float]:
+    """The navigation step towards a point, proportional to what is missing."""
     distance, angle = float(np.hypot(*point)), float(np.degrees(np.arctan2(point[1], point[0])))
-    theta_vel = float(np.clip(angle / DRIVE_PULSE_S, -MAX_THETA_VEL, MAX_THETA_VEL))
-    x_vel = float(np.clip((distance - _AIM) / DRIVE_PULSE_S, 0, MAX_X_VEL))
-    return action_dict(x_vel=x_vel if abs(angle) < _TURN_FIRST else 0.0, theta_vel=theta_vel)
+    x_vel = np.clip((distance - _AIM) / DRIVE_PULSE_S, 0, MAX_X_VEL) if abs(angle) < _TURN_FIRST else 0.0
+    return action_dict(x_vel=float(x_vel), theta_vel=float(np.clip(angle / DRIVE_PULSE_S, -MAX_THETA_VEL, MAX_THETA_VEL)))
 
 
-def _explore(row: Row) -> dict[str, float]:
-    row.memory["target"] = None
-    searched = row.memory.get("searched", 0)
-    row.memory["searched"] = searched + 1
-    if searched == 0:
-        row.memory["side"] = row.rng.choice((-1.0, 1.0))
-        row.memory["end"] = _ROUND + int(row.rng.integers(*_LEG)) + int(row.rng.integers(0, 12))
-        row.memory["turns"] = _ROUND + int(row.rng.integers(0, 12))
-    if searched >= row.memory["end"]:
-        row.memory["searched"] = 0
-    if searched < row.memory["turns"]:
-        return action_dict(theta_vel=row.memory["side"] * MAX_THETA_VEL)
-    return action_dict(x_vel=MAX_X_VEL)
-
-
-def _move_memory(row: Row, action: dict[str, float]) -> None:
-    """Where remembered places will be after a navigation step."""
-    turn = np.radians(action["theta.vel"]) * DRIVE_PULSE_S
-    forward = action["x.vel"] * DRIVE_PULSE_S
-    middle = np.array([np.cos(turn / 2), np.sin(turn / 2)]) * forward
-    rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-
-    def moved(place: FloatArray) -> FloatArray:
-        return np.asarray(rotation @ (place - middle))
-
-    if row.memory.get("target") is not None:
-        row.memory["target"] = moved(row.memory["target"])
-    tried = row.memory.get("tried", [])
-    row.memory["tried"] = [(moved(place), age + 1) for place, age in tried if age < _FORGET]
+def _search(memory: _Memory, rng: np.random.Generator) -> dict[str, float]:
+    """Look round one way, go on in a random direction, and again."""
+    memory.target = None
+    if not memory.search:
+        turns = _LOOK_ROUND + int(rng.integers(_LOOK_ROUND))
+        turn = action_dict(theta_vel=float(rng.choice((-MAX_THETA_VEL, MAX_THETA_VEL))))
+        memory.search = [turn] * turns + [action_dict(x_vel=MAX_X_VEL)] * int(rng.integers(*_LEG))
+    return memory.search.pop(0)

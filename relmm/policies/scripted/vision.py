@@ -19,6 +19,8 @@ _SIZE = (0.014, 0.055)  # m, diameter of a disc of a blob's area
 _MAX_LENGTH = 0.065  # m, longer side of a blob's bounding box; joints and slivers of furniture are longer
 _RING = 2  # pixels round a blob in which everything must look different from it
 _RING_SHARE = 0.85
+# Patterns and the ragged edges of rugs look like many objects close together; 20 objects on 9 m^2 hardly ever do.
+_CROWD_RADIUS, _CROWD = 0.25, 4  # m, and how many within that count as a pattern
 
 
 def local_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -47,6 +49,8 @@ def detect_objects(image: NDArray[np.uint8], camera: CameraGeometry) -> FloatArr
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     found = [point for contour in contours if (point := _object_at(contour, image, camera)) is not None]
     points = np.array(found).reshape(-1, 2)
+    neighbours = np.linalg.norm(points[:, None] - points, axis=-1) < _CROWD_RADIUS
+    points = points[neighbours.sum(axis=1) < _CROWD]
     return points[np.argsort(np.hypot(*points.T))]
 
 

@@ -1,0 +1,85 @@
+"""relmm-eval, and its agreement with lerobot-eval."""
+
+import json
+import sys
+
+import av
+import numpy as np
+import pytest
+
+from relmm.commands import evaluate as command
+
+SETTINGS = ("--env.type=relmm_room", "--env.room=diverse", "--env.navigation_steps=15", "--seed=7")
+
+
+def test_evaluate_agrees_with_lerobot_eval(run, tmp_path):
+    ours = run(
+        "relmm-eval",
+        *SETTINGS,
+        "--policy.type=relmm_scripted",
+        "--eval.n_episodes=3",
+        "--eval.n_videos=0",
+        "--output_dir=ours",
+    )
+    assert ours.returncode == 0, ours.stderr
+    theirs = run(
+        "lerobot-eval",
+        *SETTINGS,
+        "--policy.type=relmm_scripted",
+        "--eval.n_episodes=3",
+        "--eval.batch_size=3",
+        "--eval.use_async_envs=false",
+        "--output_dir=theirs",
+    )
+    assert theirs.returncode == 0, theirs.stderr
+    own = json.loads((tmp_path / "ours/eval_info.json").read_text())
+    stock = json.loads((tmp_path / "theirs/eval_info.json").read_text())
+    picked_up = [episode["picked_up_judged"] for episode in own["per_episode"]]
+    assert stock["per_task"][0]["metrics"]["sum_rewards"] == picked_up
+    assert sum(picked_up) > 0
+    assert own["overall"]["avg_sum_reward"] == pytest.approx(stock["overall"]["avg_sum_reward"])
+    assert own["overall"]["pc_success"] == stock["overall"]["pc_success"]
+
+
+def test_evaluate_films_the_arm_too(run, tmp_path):
+    result = run(
+        "relmm-eval", *SETTINGS, "--policy.type=relmm_random", "--eval.n_episodes=1", "--output_dir=out"
+    )
+    assert result.returncode == 0, result.stderr
+    video = tmp_path / "out/videos/eval_episode_0.mp4"
+    assert str(video.relative_to(tmp_path)) in result.stdout
+    with av.open(str(video)) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    seconds = json.loads((tmp_path / "out/eval_info.json").read_text())["per_episode"][0]["seconds"]
+    assert len(frames) == pytest.approx(seconds / 0.2, rel=0.1), "one picture every 0.2 s of the robot's life"
+    assert frames[0].shape == (480, 840, 3)
+    assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("--env.room=kitchen", "no_obstacles"),
+        ("--env.navigation_steps=0", "must be at least 1"),
+        ("--eval.n_episodes=0", "must be at least 1"),
+        ("--eval.n_videos=-1", "must not be negative"),
+        ("--env.type=pusht", "relmm_room"),
+        ("--policy.path=/nowhere/at/all", "No policy can be loaded from '/nowhere/at/all'"),
+    ],
+)
+def test_evaluate_bad_input_is_one_sentence(capsys, monkeypatch, tmp_path, bad, message):
+    policy = () if bad.startswith("--policy") else ("--policy.type=relmm_random",)
+    monkeypatch.setattr(sys, "argv", ["relmm-eval", *policy, f"--output_dir={tmp_path / 'out'}", bad])
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    errors = capsys.readouterr().err.strip()
+    assert stop.value.code == 2
+    assert message in errors and "\n" not in errors
+    assert not (tmp_path / "out").exists()
+
+
+def test_evaluate_existing_output_is_refused(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["relmm-eval", "--policy.type=relmm_random", f"--output_dir={tmp_path}"])
+    with pytest.raises(SystemExit):
+        command.main()
+    assert "exists already" in capsys.readouterr().err

@@ -1,0 +1,129 @@
+"""LeRobot's own commands, unmodified, on relmm's robot, policies, environment and datasets."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from relmm.features import ACTION_NAMES, STATE_NAMES
+
+ROBOT = ("--robot.type=locobot_sim", "--robot.room=diverse")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """A small dataset written by relmm-record."""
+    root = tmp_path_factory.mktemp("recorded") / "room"
+    script = Path(sys.executable).parent / "relmm-record"
+    subprocess.run(
+        [
+            str(script),
+            *ROBOT,
+            "--policy.type=relmm_random",
+            "--max_steps=4",
+            "--dataset.num_episodes=3",
+            "--dataset.repo_id=me/room",
+            f"--dataset.root={root}",
+        ],
+        check=True,
+    )
+    return root
+
+
+def test_lerobot_record_with_scripted_teleoperator(run, tmp_path):
+    result = run(
+        "lerobot-record",
+        *ROBOT,
+        "--teleop.type=locobot_scripted",
+        "--dataset.repo_id=me/room",
+        "--dataset.root=room",
+        "--dataset.single_task=Clean the room",
+        "--dataset.num_episodes=1",
+        "--dataset.fps=2",
+        "--dataset.episode_time_s=4",
+        "--dataset.reset_time_s=0",
+        "--dataset.video=false",
+        "--dataset.push_to_hub=false",
+        "--dataset.no_stamp=true",
+        "--play_sounds=false",
+    )
+    assert result.returncode == 0, result.stderr
+    table = pq.read_table(tmp_path / "room/data/chunk-000/file-000.parquet")
+    actions, states = np.array(table["action"].to_pylist()), np.array(table["observation.state"].to_pylist())
+    assert actions.shape[1] == len(ACTION_NAMES) and states.shape[1] == len(STATE_NAMES)
+    assert len(actions) >= 5 and np.abs(actions).sum() > 0
+
+
+def test_lerobot_replay(run, recorded):
+    result = run(
+        "lerobot-replay",
+        *ROBOT,
+        "--dataset.repo_id=me/room",
+        f"--dataset.root={recorded}",
+        "--dataset.episode=0",
+        "--play_sounds=false",
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_lerobot_rollout_from_a_saved_policy(run, tmp_path):
+    from relmm.commands.policies import make_actor
+    from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
+
+    make_actor(RelmmScriptedConfig(device="cpu")).save_pretrained(tmp_path / "policy")
+    result = run(
+        "lerobot-rollout",
+        *ROBOT,
+        "--policy.path=policy",
+        "--strategy.type=base",
+        "--duration=3",
+        "--fps=2",
+        "--task=Clean the room",
+    )
+    assert result.returncode == 0, result.stderr
+    assert "Rollout finished" in result.stderr + result.stdout
+
+
+def test_lerobot_edit_dataset_deletes_an_episode(run, recorded, tmp_path):
+    result = run(
+        "lerobot-edit-dataset",
+        "--repo_id=me/room",
+        f"--root={recorded}",
+        "--new_repo_id=me/shorter",
+        "--new_root=shorter",
+        "--operation.type=delete_episodes",
+        "--operation.episode_indices=[1]",
+    )
+    assert result.returncode == 0, result.stderr
+    episodes = pq.read_table(tmp_path / "shorter/meta/episodes")
+    assert episodes.num_rows == 2
+
+
+def test_lerobot_dataset_viz_saves_a_recording(run, recorded, tmp_path):
+    result = run(
+        "lerobot-dataset-viz",
+        "--repo-id=me/room",
+        f"--root={recorded}",
+        "--episode-index=0",
+        "--save=1",
+        "--output-dir=viz",
+        "--num-workers=0",
+    )
+    assert result.returncode == 0, result.stderr
+    assert list((tmp_path / "viz").glob("*.rrd"))
+
+
+def test_lerobot_eval_in_parallel_processes(run):
+    result = run(
+        "lerobot-eval",
+        "--policy.type=relmm_random",
+        "--env.type=relmm_room",
+        "--env.navigation_steps=5",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--output_dir=out",
+    )
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relmm.geometry import CAMERAS, CameraGeometry, arm_forward
+from relmm.robot.sensing import OBSTACLE_RADIUS, ObstacleDetector, grips_something, sees_held_object
+from relmm.robot.skills import PRESENT_POSE
+
+
+@pytest.fixture(params=CAMERAS)
+def camera(request: pytest.FixtureRequest) -> CameraGeometry:
+    return CAMERAS[request.param]
+
+
+def rays(camera: CameraGeometry) -> np.ndarray:
+    width, height = camera.size
+    return camera.rays(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1))
+
+
+def floor_depth(camera: CameraGeometry, height: float = 0.0) -> np.ndarray:
+    """What a bare plane `height` m above the floor looks like, in mm; beyond 5 m nothing is measured."""
+    down = np.minimum(rays(camera)[..., 2], -1e-9)
+    depth = (height - camera.position[2]) / down * 1000
+    return np.where(depth < 5000, depth, 0).astype(np.uint16)
+
+
+def box_depth(camera: CameraGeometry, front: float, half_width: float, top: float) -> np.ndarray:
+    """The front of a box `front` m before the robot's centre, on the floor."""
+    directions = rays(camera)
+    depth = (front - camera.position[0]) / np.maximum(directions[..., 0], 1e-9)
+    points = np.array(camera.position) + directions * depth[..., None]
+    hit = (np.abs(points[..., 1]) < half_width) & (points[..., 2] > 0) & (points[..., 2] < top)
+    return np.where(hit, depth * 1000, floor_depth(camera)).astype(np.uint16)
+
+
+# --- Grasp judgement -----------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("opening", "expected"), [(0.0, False), (0.003, False), (0.014, True), (0.03, True)])
+def test_fingers_kept_apart_grip_something(opening: float, expected: bool) -> None:
+    assert grips_something(opening) == expected
+
+
+def test_an_empty_gripper_shows_the_floor(camera: CameraGeometry) -> None:
+    assert not sees_held_object(floor_depth(camera), camera, PRESENT_POSE, 0.03)
+
+
+def test_something_between_the_pads_is_seen(camera: CameraGeometry) -> None:
+    tool_height = arm_forward(PRESENT_POSE)[3, 2]
+    assert sees_held_object(floor_depth(camera, tool_height), camera, PRESENT_POSE, 0.03)
+
+
+def test_something_far_behind_the_gripper_is_not_held(camera: CameraGeometry) -> None:
+    tool_height = arm_forward(PRESENT_POSE)[3, 2]
+    assert not sees_held_object(floor_depth(camera, tool_height - 0.1), camera, PRESENT_POSE, 0.03)
+
+
+def test_nothing_measured_is_nothing_seen(camera: CameraGeometry) -> None:
+    assert not sees_held_object(np.zeros(camera.size[::-1], np.uint16), camera, PRESENT_POSE, 0.03)
+
+
+def test_closed_fingers_do_not_break_the_judgement(camera: CameraGeometry) -> None:
+    assert not sees_held_object(floor_depth(camera), camera, PRESENT_POSE, 0.0)
+
+
+# --- Collision avoidance -------------------------------------------------------------------------------------
+def test_bare_floor_is_free(camera: CameraGeometry) -> None:
+    assert not ObstacleDetector(camera).obstructed(floor_depth(camera))
+
+
+def test_nothing_measured_is_free(camera: CameraGeometry) -> None:
+    assert not ObstacleDetector(camera).obstructed(np.zeros(camera.size[::-1], np.uint16))
+
+
+@pytest.mark.parametrize("front", [0.27, 0.30, 0.34])
+def test_a_near_wall_obstructs(camera: CameraGeometry, front: float) -> None:
+    assert ObstacleDetector(camera).obstructed(box_depth(camera, front, 2.0, 1.0))
+
+
+@pytest.mark.parametrize("front", [OBSTACLE_RADIUS + 0.03, 0.6, 1.5])
+def test_a_distant_wall_does_not(camera: CameraGeometry, front: float) -> None:
+    assert not ObstacleDetector(camera).obstructed(box_depth(camera, front, 2.0, 1.0))
+
+
+def test_a_thin_post_obstructs(camera: CameraGeometry) -> None:
+    assert ObstacleDetector(camera).obstructed(box_depth(camera, 0.32, 0.03, 1.0))
+
+
+@pytest.mark.parametrize("height", [0.02, 0.036, 0.06])
+def test_things_as_low_as_objects_do_not_obstruct(camera: CameraGeometry, height: float) -> None:
+    assert not ObstacleDetector(camera).obstructed(box_depth(camera, 0.32, 0.3, height))
+
+
+def test_a_few_noisy_pixels_do_not_obstruct(camera: CameraGeometry) -> None:
+    depth = floor_depth(camera)
+    wall = box_depth(camera, 0.3, 2.0, 1.0)
+    rows, columns = np.nonzero(wall != depth)
+    chosen = np.random.default_rng(0).choice(len(rows), 3, replace=False)
+    depth[rows[chosen], columns[chosen]] = wall[rows[chosen], columns[chosen]]
+    assert not ObstacleDetector(camera).obstructed(depth)
