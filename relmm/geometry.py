@@ -31,7 +31,9 @@ def arm_inverse(x: float, y: float, z: float, pitch: float, roll: float = 0.0) -
     """Joint angles that bring the point between the finger pads to a place.
 
     Args:
-        x, y, z: m, robot frame.
+        x: m, robot frame, forward.
+        y: m, left.
+        z: m, above the floor.
         pitch: rad, of the tool against the horizontal; pi/2 points straight down.
         roll: rad, of the wrist.
 

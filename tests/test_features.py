@@ -60,8 +60,9 @@ def test_grasp_area_is_the_cells_and_no_more() -> None:
 
 
 def test_a_full_navigation_step_is_the_papers() -> None:
-    assert MAX_X_VEL * DRIVE_PULSE_S == pytest.approx(0.106, abs=0.001)  # m
-    assert MAX_THETA_VEL * DRIVE_PULSE_S == pytest.approx(27.0)  # degrees
+    metres, degrees = MAX_X_VEL * DRIVE_PULSE_S, MAX_THETA_VEL * DRIVE_PULSE_S
+    assert metres == pytest.approx(0.106, abs=0.001)
+    assert degrees == pytest.approx(27.0)
 
 
 def test_action_dict_names_every_value() -> None:

@@ -12,18 +12,17 @@ import sys
 import types
 import warnings
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 import draccus
 from tqdm import tqdm
 
 from relmm.errors import ConfigError, RelmmError
 
-Config = TypeVar("Config")
 _USAGE_ERROR = 2
 
 
-def run(command: str, config_class: type[Config], job: Callable[[Config], None]) -> None:
+def run[Config](command: str, config_class: type[Config], job: Callable[[Config], None]) -> None:
     """Parse the command line into a config, do the job, and end with a sentence instead of a traceback.
 
     Args:
@@ -48,7 +47,7 @@ def _register_plugins() -> None:
     register_third_party_plugins()
 
 
-def _parse(config_class: type[Config]) -> Config:
+def _parse[Config](config_class: type[Config]) -> Config:
     """The command line as LeRobot parses it.
 
     Raises:
@@ -63,7 +62,7 @@ def _parse(config_class: type[Config]) -> Config:
     messages = io.StringIO()
     try:
         with contextlib.redirect_stderr(messages):
-            return parser.wrap()(identity)()  # type: ignore[no-any-return]
+            return parser.wrap()(identity)()
     except SystemExit as stop:
         if not stop.code:
             raise

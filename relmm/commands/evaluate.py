@@ -115,7 +115,8 @@ class EpisodeScore:
 
 def evaluate(config: EvalConfig) -> None:
     """Run the episodes, print a table, and write `eval_info.json` and videos."""
-    assert isinstance(config.env, RelmmRoomEnvConfig) and config.policy is not None and config.output_dir is not None
+    assert isinstance(config.env, RelmmRoomEnvConfig)
+    assert config.policy is not None
     take_seed(config.policy, 0)
     actor = make_actor(config.policy)
     env = RelmmRoomEnv(**{**config.env.gym_kwargs, "render_mode": None})

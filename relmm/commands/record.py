@@ -94,6 +94,7 @@ def record(config: RecordConfig) -> None:
     seed = config.seed + (summarize(root).episodes if config.resume and root.exists() else 0)
     take_seed(config.robot, seed)
     take_seed(config.policy, seed)
+    assert config.policy is not None
     actor = make_actor(config.policy)
     robot = make_robot_from_config(config.robot)
     if not isinstance(robot, LocobotRobot):
@@ -106,7 +107,8 @@ def record(config: RecordConfig) -> None:
 
 
 def _recorder(config: RecordConfig, root: Path, robot: LocobotRobot) -> EpisodeRecorder:
-    settings = config.robot
+    settings, policy = config.robot, config.policy
+    assert policy is not None
     info = {key: getattr(settings, key) for key in ("room", "num_objects", "camera", "seed") if hasattr(settings, key)}
     return EpisodeRecorder(
         root,
@@ -114,7 +116,7 @@ def _recorder(config: RecordConfig, root: Path, robot: LocobotRobot) -> EpisodeR
         resume=config.resume,
         depth="front_depth" in robot.observation_features,
         robot_type=robot.name,
-        info={**info, "policy": config.policy.type, "policy_path": str(config.policy.pretrained_path or "")},
+        info={**info, "policy": policy.type, "policy_path": str(policy.pretrained_path or "")},
     )
 
 

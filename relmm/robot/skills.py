@@ -70,7 +70,8 @@ class Skills:
         """One navigation step: a drive pulse, a brake, and a turn away from what stands in the way.
 
         Args:
-            x_vel: m/s. theta_vel: deg/s, positive = left.
+            x_vel: m/s.
+            theta_vel: deg/s, positive = left.
         """
         self.bumper = 0
         self._pulse(x_vel, theta_vel)

@@ -35,7 +35,8 @@ class Basket:
         """Carry nothing."""
         self._model.geom_contype[:] = self._free_contype
         self._stowed = np.array([], np.intp)
-        self._offsets, self._rotations = np.zeros((0, 3)), np.zeros((0, 4))
+        self._offsets: FloatArray = np.zeros((0, 3))
+        self._rotations: FloatArray = np.zeros((0, 4))
 
     def stow(self, indices: NDArray[np.intp]) -> None:
         """Carry these objects (their numbers in the room), too, from where they are now."""

@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from relmm.errors import PhysicsError
 from relmm.features import FloatArray
 from relmm.geometry import JOINT_LIMITS, CameraGeometry
 from relmm.robot.body import BUMPER_CENTRE, BUMPER_LEFT, BUMPER_RIGHT, MAX_OPENING, BodyState
@@ -77,7 +76,8 @@ class SimBody:
         self.data.qpos[self._fingers_qpos] = MAX_OPENING / 2
         self._arm_start = self._arm_goal = REST_POSE
         self._arm_times = (0.0, 1.0)
-        self._velocity = self._velocity_goal = np.zeros(2)
+        self._velocity: FloatArray = np.zeros(2)
+        self._velocity_goal: FloatArray = np.zeros(2)
         self.truth = Truth(self.model, self.data, self.room)
         self.data.ctrl[self._gripper_ctrl] = MAX_OPENING / 2
         self._command_arm()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from lerobot.robots.config import RobotConfig
 
 from relmm.geometry import camera_geometry
@@ -32,7 +33,7 @@ class LocobotSimConfig(RobotConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         camera_geometry(self.camera)
-        self.make_room()
+        self.make_room().scatter(np.random.default_rng(0))  # says now if the objects do not fit
 
     def make_room(self) -> Room:
         """The room these settings describe.

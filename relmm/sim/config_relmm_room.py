@@ -67,6 +67,7 @@ class RelmmRoomEnvConfig(EnvConfig):
         """
         make = freeze_after_episode_end(partial(_make_room, self.gym_kwargs))
         mode = gym.vector.AutoresetMode.SAME_STEP
+        rooms: gym.vector.VectorEnv
         if use_async_envs and n_envs > 1:
             # An OpenGL context does not survive a fork.
             rooms = gym.vector.AsyncVectorEnv([make] * n_envs, autoreset_mode=mode, context="forkserver")

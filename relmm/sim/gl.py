@@ -14,7 +14,10 @@ from typing import Any
 from relmm.errors import RenderingError
 
 _LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
-_ADVICE = "install a driver for rendering without a display with: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6, and set MUJOCO_GL=osmesa)"
+_ADVICE = (
+    "install a driver for rendering without a display with: apt-get install libegl1 libgl1-mesa-dri "
+    "(or libosmesa6, and set MUJOCO_GL=osmesa)"
+)
 
 
 def choose_backend() -> str:

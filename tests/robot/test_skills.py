@@ -129,9 +129,9 @@ def test_the_way_it_turns_is_random_and_repeats_with_the_seed(body: SimBody) -> 
         skills.navigate(0.0, 0.0)
         return float(np.sign(body.truth.robot()[2]))
 
-    directions = [turned(seed) for seed in range(8)]
+    directions = [turned(seed) for seed in range(6)]
     assert set(directions) == {-1.0, 1.0}
-    assert [turned(seed) for seed in range(8)] == directions
+    assert [turned(seed) for seed in range(6)] == directions
 
 
 def test_it_does_not_change_direction_while_turning_away(body: SimBody, skills: Skills) -> None:
@@ -210,7 +210,7 @@ def test_beside_an_object_nothing_is_picked_up(body: SimBody, skills: Skills) ->
 def test_the_judgement_is_the_truth_at_any_offset(body: SimBody) -> None:
     rng = np.random.default_rng(3)
     judged, true = [], []
-    for _ in range(25):
+    for _ in range(12):
         body.reset(rng)
         skills = Skills(body, rng)
         skills.rest()
@@ -248,9 +248,10 @@ def test_an_object_stays_held_while_driving(body: SimBody, skills: Skills) -> No
 
 
 def test_the_arm_stops_where_it_meets_a_wall(body: SimBody, skills: Skills) -> None:
-    put_robot(body, 1.5 - 0.36, 0.0, 0.0)
+    put_robot(body, 1.5 - 0.40, 0.0, 0.0)  # farther away than where a navigation step would turn
+    assert not ObstacleDetector(body.camera).obstructed(body.capture()[1])
     assert not skills.grasp(GRASP_X[1], 0.0)
-    assert body.truth.robot()[:2] == pytest.approx((1.14, 0.0), abs=0.05), "the wall was not pushed against for long"
+    assert body.truth.robot()[:2] == pytest.approx((1.10, 0.0), abs=0.05), "it must not push itself off the wall"
     np.testing.assert_allclose(body.state().joints, REST_POSE, atol=0.05)
 
 

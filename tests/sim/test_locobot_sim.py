@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +14,9 @@ from relmm.sim.rooms import Room, register_room, room_names
 
 
 @pytest.fixture
-def registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def registry(monkeypatch: pytest.MonkeyPatch) -> None:
     """A copy, so that a test's rooms end with it."""
     monkeypatch.setattr(rooms, "_ROOMS", dict(rooms._ROOMS))
-    yield
 
 
 def random_action(rng: np.random.Generator) -> dict[str, float]:

@@ -11,18 +11,10 @@ import pytest
 
 from relmm.errors import ConfigError
 from relmm.sim import rooms
+from relmm.sim.furniture import Obstacle, Rug
 from relmm.sim.objects import MAX_RADIUS, add_object, object_names, register_object
-from relmm.sim.rooms import (
-    OBJECT_PREFIX,
-    TIMESTEP,
-    Obstacle,
-    Room,
-    Rug,
-    make_room,
-    register_room,
-    room_names,
-    set_objects,
-)
+from relmm.sim.rooms import OBJECT_PREFIX, Room, make_room, register_room, room_names, set_objects
+from relmm.sim.scenery import TIMESTEP
 
 PAPER_ROOMS = ["diverse", "no_obstacles", "obstacles", "obstacles_rugs"]
 GRIPPER_OPENING = 0.044  # m

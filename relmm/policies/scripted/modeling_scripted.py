@@ -43,9 +43,13 @@ class _Memory:
 
     def look(self, found: FloatArray, camera: CameraGeometry) -> bool:
         """Take in what is seen now; false if nothing is where it was expected, because the robot has turned."""
-        pixels = camera.project(np.column_stack([self.seen, np.full(len(self.seen), OBJECT_HEIGHT)]))
-        in_view = ((pixels > _VIEW_MARGIN) & (pixels < np.array(camera.size) - 1 - _VIEW_MARGIN)).all(axis=1)
+        in_view = _in_view(self.seen, camera)
         again = (_distances(self.seen, found) < _SAME).any(axis=1)
+        if self.target is not None and _in_view(self.target[None], camera)[0]:
+            if not (np.linalg.norm(found - self.target, axis=1) < _SAME).any():
+                # Not there from here: a stain, a pattern, or something hidden now. Do not dither in front of it.
+                self.tried = np.vstack([self.tried, [*self.target, 0]])
+                self.target = None
         as_expected = not in_view.any() or bool(again[in_view].any())
         kept = self.seen[~in_view & ~again] if as_expected else np.zeros((0, 2))
         self.seen = np.concatenate([found, kept])
@@ -95,6 +99,13 @@ class RelmmScriptedPolicy(ControllerPolicy):
         return action
 
 
+def _in_view(places: FloatArray, camera: CameraGeometry) -> NDArray[np.bool_]:
+    """Which of some places (n, 2) the camera must see, shape (n,)."""
+    pixels = camera.project(np.column_stack([places, np.full(len(places), OBJECT_HEIGHT)]))
+    inside = (pixels > _VIEW_MARGIN) & (pixels < np.array(camera.size) - 1 - _VIEW_MARGIN)
+    return np.asarray(inside.all(axis=1))
+
+
 def _distances(places: FloatArray, others: FloatArray) -> FloatArray:
     """Between (n, 2) and (m, 2), shape (n, m)."""
     return np.asarray(np.linalg.norm(places[:, None] - others, axis=-1))
@@ -112,7 +123,7 @@ def _begin_leaving(memory: _Memory, rng: np.random.Generator) -> None:
 
 def _grasp(point: FloatArray, memory: _Memory) -> dict[str, float]:
     memory.target, memory.detours, memory.leave = None, 0, 0
-    memory.seen = np.zeros((0, 2))[:0] if len(memory.seen) == 0 else memory.seen[(memory.seen != point).any(axis=1)]
+    memory.seen = memory.seen[(memory.seen != point).any(axis=1)]
     memory.tried = np.vstack([memory.tried, [*point, 0]])
     return grasp_cell(xy_to_cell(*point))
 

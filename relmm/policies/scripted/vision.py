@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -47,44 +49,51 @@ def detect_objects(image: NDArray[np.uint8], camera: CameraGeometry) -> FloatArr
     """
     mask = (local_contrast(image) > _CONTRAST).astype(np.uint8)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    found = [point for contour in contours if (point := _object_at(contour, image, camera)) is not None]
-    points = np.array(found).reshape(-1, 2)
+    blobs = (_Blob(np.asarray(contour), image, camera) for contour in contours)
+    points = np.array([blob.place for blob in blobs if blob.is_object()]).reshape(-1, 2)
     neighbours = np.linalg.norm(points[:, None] - points, axis=-1) < _CROWD_RADIUS
     points = points[neighbours.sum(axis=1) < _CROWD]
     return points[np.argsort(np.hypot(*points.T))]
 
 
-def _object_at(contour: NDArray[np.int32], image: NDArray[np.uint8], camera: CameraGeometry) -> FloatArray | None:
-    """The point on the floor of a contour's centroid, unless it cannot be an object."""
-    left, top, width, height = cv2.boundingRect(contour)
-    if left == 0 or top == 0 or left + width == image.shape[1] or top + height == image.shape[0]:
-        return None  # cut off by the picture's edge
-    inside = np.zeros(image.shape[:2], np.uint8)
-    cv2.drawContours(inside, [contour], -1, 1, cv2.FILLED)
-    moments = cv2.moments(inside, binaryImage=True)
-    centroid = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
-    point = camera.pixel_to_floor(centroid, OBJECT_HEIGHT)
-    if not np.isfinite(point).all():
-        return None
-    pixel = _metres_per_pixel(point, camera)
-    size = 2 * np.sqrt(moments["m00"] * pixel.prod() / np.pi)
-    length = (np.array([width, height]) * pixel).max()
-    # The edges of a blob are known to a pixel only.
-    if not _SIZE[0] <= size <= _SIZE[1] + pixel.max() or length > _MAX_LENGTH + pixel.max():
-        return None
-    return point if _stands_out(inside, image) else None
+class _Blob:
+    """What a contour encloses.
 
+    Attributes:
+        place: its centroid on the floor, m, robot frame, shape (2,); NaN above the horizon.
+    """
 
-def _metres_per_pixel(point: FloatArray, camera: CameraGeometry) -> FloatArray:
-    """Width and height of a pixel at a point on the floor, across the line of sight; m."""
-    offset = np.array([*point, OBJECT_HEIGHT]) - np.array(camera.position)
-    return np.asarray(offset @ camera.axes[2] / camera.focal)
+    def __init__(self, contour: NDArray[Any], image: NDArray[np.uint8], camera: CameraGeometry) -> None:
+        self._image = image
+        self._box = cv2.boundingRect(contour)  # left, top, width, height
+        self._inside = np.zeros(image.shape[:2], np.uint8)
+        cv2.drawContours(self._inside, [contour], -1, 1, cv2.FILLED)
+        moments = cv2.moments(self._inside, binaryImage=True)
+        self._pixels = moments["m00"]
+        self.place = camera.pixel_to_floor(np.array([moments["m10"], moments["m01"]]) / self._pixels, OBJECT_HEIGHT)
+        # Width and height of a pixel there, across the line of sight; m.
+        offset = np.array([*self.place, OBJECT_HEIGHT]) - np.array(camera.position)
+        self._pixel = offset @ camera.axes[2] / camera.focal
 
+    def is_object(self) -> bool:
+        """Whether it is whole, on the floor, as large as an object and unlike its surroundings."""
+        return self._is_whole() and self._has_size_of_object() and self._stands_out()
 
-def _stands_out(inside: NDArray[np.uint8], image: NDArray[np.uint8]) -> bool:
-    """Whether a blob differs from everything round it, unlike the corners that a median rounds off."""
-    near = cv2.dilate(inside, np.ones((3, 3), np.uint8))
-    ring = cv2.dilate(near, np.ones((2 * _RING + 1, 2 * _RING + 1), np.uint8)) - near
-    color = np.median(image[inside > 0], axis=0)
-    different = np.abs(image[ring > 0] - color).max(axis=1) > _CONTRAST
-    return bool(different.mean() >= _RING_SHARE)
+    def _is_whole(self) -> bool:
+        left, top, width, height = self._box
+        return left > 0 and top > 0 and left + width < self._image.shape[1] and top + height < self._image.shape[0]
+
+    def _has_size_of_object(self) -> bool:
+        """Never true above the horizon, where sizes are NaN. The edges of a blob are known to a pixel only."""
+        size = 2 * np.sqrt(self._pixels * self._pixel.prod() / np.pi)
+        length = (np.array(self._box[2:]) * self._pixel).max()
+        slack = self._pixel.max()
+        return bool(_SIZE[0] <= size <= _SIZE[1] + slack and length <= _MAX_LENGTH + slack)
+
+    def _stands_out(self) -> bool:
+        """Whether it differs from everything round it, unlike the corners that a median rounds off."""
+        near = cv2.dilate(self._inside, np.ones((3, 3), np.uint8))
+        ring = cv2.dilate(near, np.ones((2 * _RING + 1, 2 * _RING + 1), np.uint8)) - near
+        color = np.median(self._image[self._inside > 0], axis=0)
+        different = np.abs(self._image[ring > 0] - color).max(axis=1) > _CONTRAST
+        return bool(different.mean() >= _RING_SHARE)
