@@ -1,0 +1,107 @@
+"""The collection loop on the simulated robot."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from relmm.commands.policies import make_actor
+from relmm.features import FREE_GRASPS, Phase, Skill
+from relmm.learning.collect import Collector
+from relmm.policies.random.configuration_random import RelmmRandomConfig
+from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
+from relmm.sim.config_locobot_sim import LocobotSimConfig
+from relmm.sim.locobot_sim import LocobotSim
+
+
+@dataclass
+class ListRecorder:
+    """Keeps what the loop records."""
+
+    frames: list[tuple[dict[str, Any], dict[str, float], dict[str, Any], str]] = field(default_factory=list)
+    episodes: list[list[tuple[dict[str, Any], dict[str, float], dict[str, Any], str]]] = field(default_factory=list)
+
+    def add_frame(self, *frame: Any) -> None:
+        self.frames.append(frame)
+
+    def save_episode(self) -> None:
+        self.episodes.append(self.frames)
+        self.frames = []
+
+
+@pytest.fixture
+def robot():
+    robot = LocobotSim(LocobotSimConfig(seed=5))
+    robot.connect()
+    yield robot
+    robot.disconnect()
+
+
+def collector(robot: LocobotSim, policy, **settings: Any) -> tuple[Collector, ListRecorder]:
+    recorder = ListRecorder()
+    defaults = {"max_steps": 12, "pseudo_reset_steps": 2, "should_stop": lambda: False}
+    rng = np.random.default_rng(0)
+    return Collector(
+        robot, make_actor(policy), recorder, clock=robot.seconds, rng=rng, **{**defaults, **settings}
+    ), recorder
+
+
+def test_episode_ends_at_its_step_limit(robot):
+    loop, recorder = collector(robot, RelmmRandomConfig(device="cpu", grasp_probability=0.0))
+    result = loop.episode()
+    (episode,) = recorder.episodes
+    assert result.frames == len(episode) == 12 and not result.success and result.grasps == 0
+    assert [outcome["next.truncated"] for _, _, outcome, _ in episode] == [False] * 11 + [True]
+    assert not any(outcome["next.done"] for _, _, outcome, _ in episode)
+
+
+def test_only_grasps_beyond_the_free_ones_count_as_steps(robot):
+    loop, recorder = collector(robot, RelmmRandomConfig(device="cpu", grasp_probability=1.0, num_grasp=3))
+    loop.episode()
+    (episode,) = recorder.episodes
+    steps = in_a_row = 0
+    for _, action, _, _ in episode:
+        grasp = action["skill.pos"] == Skill.GRASP
+        in_a_row = in_a_row + 1 if grasp else 0
+        steps += not grasp or in_a_row > FREE_GRASPS
+    assert steps == 12 or episode[-1][2]["next.done"]
+
+
+def test_frames_follow_one_another_in_time(robot):
+    loop, recorder = collector(robot, RelmmRandomConfig(device="cpu"))
+    loop.episode()
+    loop.episode()
+    frames = [frame for episode in recorder.episodes for frame in episode]
+    times = [outcome["complementary_info.robot_time"] for _, _, outcome, _ in frames]
+    assert all(later - earlier >= 0.5 - 1e-6 for earlier, later in zip(times, times[1:], strict=False))
+    driven = [frame for frame in zip(frames, frames[1:], strict=False) if frame[0][1]["x.vel"] > 0.1]
+    for (_, action, _, _), (after, *_rest) in driven:
+        assert after["x.vel"] <= action["x.vel"] + 0.05, "the next frame shows what this frame's action did"
+
+
+def test_success_ends_the_episode_and_is_carried_elsewhere(robot):
+    loop, recorder = collector(robot, RelmmScriptedConfig(device="cpu"), max_steps=250)
+    first, second = loop.episode(), loop.episode()
+    assert first.success and second.success
+    last = recorder.episodes[0][-1]
+    assert last[1]["skill.pos"] == Skill.GRASP and last[2]["next.reward"] == 1.0 and last[2]["next.done"]
+    phases = [outcome["complementary_info.phase"] for _, _, outcome, _ in recorder.episodes[1]]
+    assert phases[:9] == [Phase.PSEUDO_RESET] * 9, "2 drives, 1 placement, 4 turns, 2 drives"
+    assert set(phases[9:]) == {Phase.LEARNING}
+    rewards = [outcome["next.reward"] for episode in recorder.episodes for _, _, outcome, _ in episode]
+    assert sum(rewards) == 2
+
+
+@pytest.mark.parametrize("stop_after", [1, 5])
+def test_stopping_cuts_the_episode_off_after_the_frame(robot, stop_after):
+    asked = []
+
+    def stop() -> bool:
+        asked.append(None)
+        return len(asked) >= stop_after
+
+    loop, recorder = collector(robot, RelmmRandomConfig(device="cpu", grasp_probability=0.0), should_stop=stop)
+    result = loop.episode()
+    assert result.frames == stop_after
+    assert recorder.episodes[0][-1][2]["next.truncated"]
