@@ -13,11 +13,13 @@ os.environ["OMP_NUM_THREADS"] = "1"  # read when numpy is imported
 
 import argparse
 import csv
+import itertools
 import platform
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -26,13 +28,24 @@ import mujoco
 import numpy as np
 from tqdm import tqdm
 
-from relmm.features import BASKET_XY, GRID, MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict, cell_to_xy
+from relmm.episodes import EpisodeRecorder
+from relmm.features import (
+    BASKET_XY,
+    GRID,
+    MAX_THETA_VEL,
+    MAX_X_VEL,
+    Skill,
+    action_dict,
+    cell_to_xy,
+    outcome_features,
+)
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.locobot_sim import LocobotSim
 from relmm.sim.renderer import Renderer
 
 OUTPUT = Path(__file__).parent / "results" / "sim_speed.csv"
 WARM_UP_STEPS = 20  # first pictures compile shaders
+EPISODE_FRAMES = 100
 STEPS_PER_GRASP = 5  # one attempt for so many steps
 
 
@@ -63,10 +76,13 @@ class PartTimer:
             yield
 
 
-def use_one_core() -> None:
-    """Pin this process to the last core it may use."""
-    if hasattr(os, "sched_setaffinity"):  # Linux only
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Pin this process, and those started in here, to the last core it may use."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})
+    yield
+    os.sched_setaffinity(0, cores)
 
 
 def describe_machine() -> str:
@@ -136,6 +152,30 @@ def measure_grasping(robot: LocobotSim, attempts: int, rng: np.random.Generator)
     return measure("grasping", attempts, move_on, lambda: step(robot, random_grasp(rng))) | {"avoidance_turns": 0}
 
 
+def measure_recording(robot: LocobotSim, steps: int, rng: np.random.Generator, cores: int) -> dict[str, float]:
+    """The same drives, recorded; the time until the last frame is durable counts."""
+    outcome = dict.fromkeys(outcome_features(), 0)
+    with tempfile.TemporaryDirectory() as folder, one_core() if cores == 1 else nullcontext():
+        recorder = EpisodeRecorder(
+            Path(folder) / "dataset", "benchmark/speed", resume=False, depth=False, robot_type=robot.name, info={}
+        )
+        with recorder, one_core():
+            observation, frames = robot.get_observation(), itertools.count(1)
+
+            def act() -> None:
+                nonlocal observation
+                done = robot.send_action(random_drive(rng))
+                recorder.add_frame(observation, done, outcome, "benchmark")
+                observation = robot.get_observation()
+                frame = next(frames)
+                if frame % EPISODE_FRAMES == 0 or frame == steps:
+                    recorder.save_episode()
+                if frame == steps:
+                    recorder.flush()
+
+            return measure(f"recorded, {cores} cores", steps, lambda: None, act) | {"avoidance_turns": 0}
+
+
 def run(room: str, steps: int, seed: int) -> list[dict[str, Any]]:
     """Measure navigation, then grasping, in one room."""
     robot = LocobotSim(LocobotSimConfig(room=room, seed=seed, depth=True))
@@ -143,10 +183,16 @@ def run(room: str, steps: int, seed: int) -> list[dict[str, Any]]:
     rng = np.random.default_rng(seed)
     for _ in range(WARM_UP_STEPS):
         step(robot, random_drive(rng))
-    rows = {
-        "navigation": measure_navigation(robot, steps, rng),
-        "grasping": measure_grasping(robot, max(steps // STEPS_PER_GRASP, 1), rng),
-    }
+    robot.reset(seed)
+    rows = {}
+    with one_core():
+        rows["navigation"] = measure_navigation(robot, steps, np.random.default_rng(seed))
+        rows["grasping"] = measure_grasping(robot, max(steps // STEPS_PER_GRASP, 1), rng)
+    for cores in (2, 1):
+        robot.reset(seed)
+        rows[f"navigation, recorded, writer on {'its own' if cores == 2 else 'the same'} core"] = measure_recording(
+            robot, steps, np.random.default_rng(seed), cores
+        )
     objects = robot.body.room.num_objects
     robot.disconnect()
     return [{"room": room, "objects": objects, "seed": seed, "task": task, **row} for task, row in rows.items()]
@@ -155,10 +201,10 @@ def run(room: str, steps: int, seed: int) -> list[dict[str, Any]]:
 def show(rows: list[dict[str, Any]]) -> None:
     """Print a table."""
     columns = ("task", "count", "per_second", "physics_ms", "rendering_ms", "rest_ms", "core_share", "avoidance_turns")
-    print("".join(f"{column:>16}" for column in columns))
+    print(f"{columns[0]:48}" + "".join(f"{column:>16}" for column in columns[1:]))
     for row in rows:
-        values = (f"{row[c]:.2f}" if isinstance(row[c], float) else str(row[c]) for c in columns)
-        print("".join(f"{value:>16}" for value in values))
+        values = (f"{row[c]:.2f}" if isinstance(row[c], float) else str(row[c]) for c in columns[1:])
+        print(f"{row['task']:48}" + "".join(f"{value:>16}" for value in values))
 
 
 def save(rows: list[dict[str, Any]], path: Path) -> None:
@@ -178,7 +224,6 @@ def main() -> None:
     parser.add_argument("--room", default="no_obstacles")
     parser.add_argument("--output", type=Path, default=OUTPUT)
     arguments = parser.parse_args()
-    use_one_core()
     machine = describe_machine()
     print(machine)
     rows = run(arguments.room, arguments.steps, arguments.seed)

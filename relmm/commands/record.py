@@ -114,6 +114,7 @@ def _recorder(config: RecordConfig, root: Path, robot: LocobotRobot) -> EpisodeR
         root,
         config.dataset.repo_id,
         resume=config.resume,
+        save_unfinished=True,
         depth="front_depth" in robot.observation_features,
         robot_type=robot.name,
         info={**info, "policy": policy.type, "policy_path": str(policy.pretrained_path or "")},

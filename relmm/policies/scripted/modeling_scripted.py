@@ -22,10 +22,9 @@ _AHEAD = 15.0  # degrees either side, where the robot is known to have space aft
 
 _VIEW_MARGIN = 5  # pixels; objects cut by the picture's edge are not detected
 _SAME = 0.12  # m between an object and where it was expected; centroids at 2 m err by 4 cm and driving adds to it
-_TRIED_RADIUS, _TRIED_STEPS = 0.03, 20  # m and steps in which a place that was grasped in vain is left alone
-_STEP, _TURN = MAX_X_VEL * DRIVE_PULSE_S, MAX_THETA_VEL * DRIVE_PULSE_S  # m and degrees in a navigation step
+_TRIED_RADIUS, _TRIED_STEPS = 0.03, 20  # m round a place without success, and for how many steps it is left alone
 
-_LOOK_ROUND = int(np.ceil(360 / _TURN)) - 1  # steps; the first and the last view are 60 degrees wide
+_LOOK_ROUND = 12  # steps of 27 degrees, after which everything round the robot has been in view
 _LEG = (4, 12)  # steps straight on after looking round in vain; 0.4 to 1.2 m
 _MAX_LEAVE = 6  # steps straight on after a detour
 
@@ -34,7 +33,7 @@ _MAX_LEAVE = 6  # steps straight on after a detour
 class _Memory:
     """Places in the robot's present frame (m), and what the robot is up to."""
 
-    seen: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # objects, also those out of view by now
+    seen: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # objects of the last picture
     tried: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # x, y and the steps since
     target: FloatArray | None = None
     search: list[dict[str, float]] = field(default_factory=list)  # what remains of a search
@@ -43,24 +42,23 @@ class _Memory:
 
     def look(self, found: FloatArray, camera: CameraGeometry) -> bool:
         """Take in what is seen now; false if nothing is where it was expected, because the robot has turned."""
-        in_view = _in_view(self.seen, camera)
-        again = (_distances(self.seen, found) < _SAME).any(axis=1)
-        if self.target is not None and _in_view(self.target[None], camera)[0]:
-            if not (np.linalg.norm(found - self.target, axis=1) < _SAME).any():
-                # Not there from here: a stain, a pattern, or something hidden now. Do not dither in front of it.
-                self.tried = np.vstack([self.tried, [*self.target, 0]])
-                self.target = None
-        as_expected = not in_view.any() or bool(again[in_view].any())
-        kept = self.seen[~in_view & ~again] if as_expected else np.zeros((0, 2))
-        self.seen = np.concatenate([found, kept])
-        return as_expected
+        expected = self.seen[_in_view(self.seen, camera)]
+        self.seen = found
+        if self.target is not None and _in_view(self.target[None], camera)[0] and not _near(self.target, found).any():
+            # A stain, a pattern, or hidden from here: without this the robot would dither in front of it.
+            self.leave_alone(self.target)
+            self.target = None
+        return len(expected) == 0 or any(_near(place, found).any() for place in expected)
+
+    def leave_alone(self, place: FloatArray) -> None:
+        """Do not try to grasp there again for a while."""
+        self.tried = np.vstack([self.tried, [*place, 0]])
 
     def worth_trying(self) -> FloatArray:
-        """Objects that can be reached and were not grasped in vain lately, shape (n, 2), quickest to reach first."""
-        distance, angle = np.hypot(*self.seen.T), np.abs(np.degrees(np.arctan2(self.seen[:, 1], self.seen[:, 0])))
-        steps = distance / _STEP + np.maximum(angle - _TURN, 0) / _TURN
-        good = (distance >= _NEAREST) & (_distances(self.seen, self.tried[:, :2]) > _TRIED_RADIUS).all(axis=1)
-        return self.seen[good][np.argsort(steps[good])]
+        """Objects in view that can be reached and are not to be left alone, shape (n, 2), closest first."""
+        apart = np.linalg.norm(self.seen[:, None] - self.tried[:, :2], axis=-1)
+        good = (np.hypot(*self.seen.T) >= _NEAREST) & (apart > _TRIED_RADIUS).all(axis=1)
+        return np.asarray(self.seen[good])
 
     def move(self, action: dict[str, float]) -> None:
         """Carry the places along with the robot through a navigation step."""
@@ -75,7 +73,7 @@ class _Memory:
 
 
 class RelmmScriptedPolicy(ControllerPolicy):
-    """Drives to the closest object it has seen and grasps it; searches at random where there is none."""
+    """Drives to the closest object it sees and grasps it; searches at random where there is none."""
 
     config_class = RelmmScriptedConfig
     name = "relmm_scripted"
@@ -106,9 +104,9 @@ def _in_view(places: FloatArray, camera: CameraGeometry) -> NDArray[np.bool_]:
     return np.asarray(inside.all(axis=1))
 
 
-def _distances(places: FloatArray, others: FloatArray) -> FloatArray:
-    """Between (n, 2) and (m, 2), shape (n, m)."""
-    return np.asarray(np.linalg.norm(places[:, None] - others, axis=-1))
+def _near(place: FloatArray, places: FloatArray) -> NDArray[np.bool_]:
+    """Which of some places (n, 2) may be the same object as one, shape (n,)."""
+    return np.asarray(np.linalg.norm(places - place, axis=1) < _SAME)
 
 
 def _begin_leaving(memory: _Memory, rng: np.random.Generator) -> None:
@@ -122,16 +120,16 @@ def _begin_leaving(memory: _Memory, rng: np.random.Generator) -> None:
 
 
 def _grasp(point: FloatArray, memory: _Memory) -> dict[str, float]:
-    memory.target, memory.detours, memory.leave = None, 0, 0
+    memory.leave_alone(point)
     memory.seen = memory.seen[(memory.seen != point).any(axis=1)]
-    memory.tried = np.vstack([memory.tried, [*point, 0]])
+    memory.target, memory.detours, memory.leave = None, 0, 0
     return grasp_cell(xy_to_cell(*point))
 
 
 def _navigate(objects: FloatArray, memory: _Memory, rng: np.random.Generator) -> dict[str, float]:
     if memory.leave > 0:
         memory.leave -= 1
-        objects = objects[np.abs(np.degrees(np.arctan2(objects[:, 1], objects[:, 0]))) < _AHEAD]
+        objects = objects[np.abs(_angles(objects)) < _AHEAD]
         if len(objects) == 0:
             return action_dict(x_vel=MAX_X_VEL)
     if len(objects) == 0:
@@ -142,19 +140,23 @@ def _navigate(objects: FloatArray, memory: _Memory, rng: np.random.Generator) ->
 
 
 def _choose(objects: FloatArray, target: FloatArray | None) -> FloatArray:
-    """The object that the robot was on its way to, else the first one."""
-    if target is not None:
-        distance = np.linalg.norm(objects - target, axis=1)
-        if distance.min() < _SAME:
-            return objects[distance.argmin()]
-    return objects[0]
+    """The object that the robot was on its way to, else the closest."""
+    if target is None or not _near(target, objects).any():
+        return np.asarray(objects[0])
+    return np.asarray(objects[np.linalg.norm(objects - target, axis=1).argmin()])
 
 
 def _approach(point: FloatArray) -> dict[str, float]:
     """The navigation step towards a point, proportional to what is missing."""
-    distance, angle = float(np.hypot(*point)), float(np.degrees(np.arctan2(point[1], point[0])))
+    distance, angle = np.hypot(*point), _angles(point)
     x_vel = np.clip((distance - _AIM) / DRIVE_PULSE_S, 0, MAX_X_VEL) if abs(angle) < _TURN_FIRST else 0.0
-    return action_dict(x_vel=float(x_vel), theta_vel=float(np.clip(angle / DRIVE_PULSE_S, -MAX_THETA_VEL, MAX_THETA_VEL)))
+    theta_vel = np.clip(angle / DRIVE_PULSE_S, -MAX_THETA_VEL, MAX_THETA_VEL)
+    return action_dict(x_vel=float(x_vel), theta_vel=float(theta_vel))
+
+
+def _angles(places: FloatArray) -> FloatArray:
+    """Bearings of places (..., 2) in degrees, positive = left."""
+    return np.asarray(np.degrees(np.arctan2(places[..., 1], places[..., 0])))
 
 
 def _search(memory: _Memory, rng: np.random.Generator) -> dict[str, float]:
