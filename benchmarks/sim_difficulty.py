@@ -233,6 +233,7 @@ PUSH_RADIUS = 0.21  # m from the robot's centre, within which the base pushes an
 STANDING_DISTANCES = (0.36, 0.42)  # m from the robot's centre to the object it wants to grasp
 PATIENCE = 4  # failed attempts at an object before others are tried
 MAX_STEPS = 30  # towards one object before others are tried
+STUCK_STEPS, ESCAPE_STEPS = 8, 4  # without getting anywhere, then straight on wherever it looks
 PREFERENCE = 3.0  # steps by which another object must be cheaper to be preferred to the present one
 LOOK_AHEAD = 0.2  # m of the way ahead that the controller steers for at least
 REACH_MARGIN = 0.012  # m inside the grasp rectangle to aim for
@@ -326,6 +327,8 @@ class Controller:
         self._target = -1
         self._attempts = 0
         self._steps = 0  # with this target
+        self._places: list[FloatArray] = []  # where it was after each navigation step since the last escape
+        self._escape = 0
         self._failures = np.zeros(body.room.num_objects)
 
     def act(self, holding: bool) -> dict[str, float]:
@@ -341,7 +344,17 @@ class Controller:
         if self._steps % MAX_STEPS == 0:
             self._failures[self._target] += PATIENCE
         self._failures = np.maximum(self._failures - 0.1, 0)  # after a while an object deserves another chance
-        return self._navigate()
+        return self._drive(np.array([STEP_LENGTH, 0.0])) if self._is_stuck() else self._navigate()
+
+    def _is_stuck(self) -> bool:
+        """Whether to drive straight on: near obstacles the robot's own avoidance may undo every turn that it makes."""
+        self._escape -= 1
+        self._places.append(np.array(self._body.truth.robot()[:2]))
+        recent = np.array(self._places[-STUCK_STEPS:])
+        if len(recent) == STUCK_STEPS and np.ptp(recent, axis=0).max() < STEP_LENGTH / 2:
+            self._places, self._escape = [], ESCAPE_STEPS
+            self._failures[self._target] += PATIENCE
+        return self._escape > 0
 
     def _grasp(self, index: int) -> dict[str, float]:
         self._attempts += 1

@@ -46,7 +46,7 @@ FPS = int(1 / NAVIGATION_STEP_S)  # frames per second of datasets and videos
 FREE_GRASPS = 2  # attempts after a navigation step that cost no step of an episode (N_grasp of the paper)
 
 # Where a carried object is dropped to count as collected: the middle of the basket on the robot's right-hand side.
-BASKET_XY = (0.025, -0.1125)  # m, robot frame
+BASKET_XY = (0.025, -0.1075)  # m, robot frame
 
 # --- Observations --------------------------------------------------------------------------------------------
 JOINT_NAMES = ("waist.pos", "shoulder.pos", "elbow.pos", "wrist_angle.pos", "wrist_rotate.pos")  # degrees

@@ -7,6 +7,7 @@ gripper and the camera alone.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -20,16 +21,20 @@ from relmm.robot.sensing import ObstacleDetector, grips_something, sees_held_obj
 logger = logging.getLogger(__name__)
 
 _DOWN = np.pi / 2  # rad, tool pitch
-REST_POSE = np.array([0.0, -1.3, 1.58, 0.8, 0.0])  # rad; fingers just below the camera's view
+# rad; folded a little tighter than the authors': the fingers and what they hold stay inside the base's circle, so that
+# the bumper meets a wall before they do, and out of the camera's view.
+REST_POSE = arm_inverse(0.15, 0.0, 0.15, pitch=1.3)
 PRESENT_POSE = arm_inverse(0.42, 0.0, 0.20, pitch=0.0)  # gripper level in front of the camera, floor far behind it
 _ABOVE_Z, _GRASP_Z, _PLACE_Z = 0.10, 0.014, 0.018  # m, of the point between the pads
-_IN_BASKET = arm_inverse(*BASKET_XY, 0.20, pitch=_DOWN)
-_OVER_BASKET = arm_inverse(*BASKET_XY, 0.30, pitch=_DOWN)
+_IN_BASKET = arm_inverse(*BASKET_XY, 0.235, pitch=_DOWN)
+_OVER_BASKET = arm_inverse(*BASKET_XY, 0.31, pitch=_DOWN)
 _BESIDE_BASKET = np.array([0.0, *_OVER_BASKET[1:]])  # the same height in front: the waist turns over the basket's rim
 _SQUEEZE = -0.005  # m, an opening that cannot be reached, so that the fingers press with all their force
 
 _WATCH_S = 0.04  # s between looks at the bumper and at the arm's tracking error
-_MAX_TRACKING_ERROR = 0.25  # rad; more means that the arm pushes against something
+_MAX_TRACKING_ERROR = 0.22  # rad; the servos lag 0.15 at full speed, more means that the arm pushes against something
+_MAX_JOINT_SPEED = 3.0  # rad/s; the motors' limit is pi
+_MIN_MOVE_S = 0.36  # s
 _BACK_OFF_VEL, _BACK_OFF_S = -0.15, 0.4  # m/s and s, after the bumper was hit
 _MAX_TURNS = 14  # navigation steps of turning on the spot, a little over one round
 
@@ -64,7 +69,7 @@ class Skills:
 
     def rest(self) -> None:
         """Fold the arm for driving."""
-        self._move(REST_POSE, 0.6)
+        self._move(REST_POSE)
 
     def navigate(self, x_vel: float, theta_vel: float) -> None:
         """One navigation step: a drive pulse, a brake, and a turn away from what stands in the way.
@@ -88,11 +93,11 @@ class Skills:
         A failed attempt ends at rest with open fingers, a successful one at rest with the object held.
         """
         self._body.set_gripper(MAX_OPENING)
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.6)
-        self._move(arm_inverse(x, y, _GRASP_Z, _DOWN), 0.35)
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
+        self._move(arm_inverse(x, y, _GRASP_Z, _DOWN))
         self._body.set_gripper(_SQUEEZE)
         self._wait(0.3)
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.35)
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
         self._grasped = grips_something(self._body.state().gripper) and self._present()
         if not self._grasped:
             self._body.set_gripper(MAX_OPENING)
@@ -101,19 +106,19 @@ class Skills:
 
     def place(self, x: float, y: float) -> None:
         """Put the held object down at a point of the floor (m, robot frame)."""
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.6)
-        self._move(arm_inverse(x, y, _PLACE_Z, _DOWN), 0.35)
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
+        self._move(arm_inverse(x, y, _PLACE_Z, _DOWN))
         self._release()
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN), 0.35)
+        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
         self.rest()
 
     def place_in_basket(self) -> None:
         """Drop the held object into the basket at the robot's side."""
         for pose in (_BESIDE_BASKET, _OVER_BASKET, _IN_BASKET):
-            self._move(pose, 0.7)
+            self._move(pose)
         self._release()
         for pose in (_OVER_BASKET, _BESIDE_BASKET, REST_POSE):
-            self._move(pose, 0.7)
+            self._move(pose)
 
     def _release(self) -> None:
         self._body.set_gripper(MAX_OPENING)
@@ -122,7 +127,7 @@ class Skills:
 
     def _present(self) -> bool:
         """Lift the gripper into view and look whether something is between the pads."""
-        self._move(PRESENT_POSE, 0.7)
+        self._move(PRESENT_POSE)
         state = self._body.state()
         return sees_held_object(self.picture()[1], self._body.camera, state.joints, state.gripper)
 
@@ -154,8 +159,10 @@ class Skills:
         self._body.drive(0.0, 0.0)
         self._wait(NAVIGATION_STEP_S - DRIVE_PULSE_S)
 
-    def _move(self, joints: FloatArray, seconds: float) -> None:
-        """Move the arm, and stop it where it meets resistance."""
+    def _move(self, joints: FloatArray) -> None:
+        """Move the arm as fast as its joints may turn, and stop it where it meets resistance."""
+        distance = np.max(np.abs(joints - self._body.state().joints))
+        seconds = max(1.5 * distance / _MAX_JOINT_SPEED, _MIN_MOVE_S)  # a smooth profile peaks at 1.5 times its mean
         self._body.move_arm(joints, seconds)
         if self._watch(seconds, self._arm_blocked):
             self._body.move_arm(self._body.state().joints, _WATCH_S)
@@ -167,7 +174,7 @@ class Skills:
 
     def _watch(self, seconds: float, condition: Callable[[], bool]) -> bool:
         """Let time pass until a condition holds; whether it did."""
-        for _ in range(round(seconds / _WATCH_S)):
+        for _ in range(math.ceil(seconds / _WATCH_S)):
             self._wait(_WATCH_S)
             if condition():
                 return True

@@ -51,6 +51,7 @@ class SimBody:
         self._wheel_qpos, self._wheel_ctrl = self._qpos(*_WHEELS), self._ctrl(*_WHEELS)
         self._fingers_qpos, self._gripper_ctrl = self._qpos("finger_left", "finger_right"), self._ctrl("gripper")
         self._shell, self._base = self.model.geom(ROBOT + "shell").id, self.model.body(ROBOT + "base").id
+        self._forget_commands()
 
     def _qpos(self, *joints: str) -> NDArray[np.intp]:
         return np.array([self.model.joint(ROBOT + name).qposadr[0] for name in joints])
@@ -74,14 +75,18 @@ class SimBody:
         set_objects(self.model, self.data, self.room.scatter(rng))
         self.data.qpos[self._arm_qpos] = REST_POSE
         self.data.qpos[self._fingers_qpos] = MAX_OPENING / 2
-        self._arm_start = self._arm_goal = REST_POSE
-        self._arm_times = (0.0, 1.0)
-        self._velocity: FloatArray = np.zeros(2)
-        self._velocity_goal: FloatArray = np.zeros(2)
+        self._forget_commands()
         self.truth = Truth(self.model, self.data, self.room)
         self.data.ctrl[self._gripper_ctrl] = MAX_OPENING / 2
         self._command_arm()
         self.wait(_SETTLE_S)
+
+    def _forget_commands(self) -> None:
+        self._arm_start = self._arm_goal = REST_POSE
+        self._arm_times = (0.0, _CONTROL_S)
+        self._velocity: FloatArray = np.zeros(2)
+        self._velocity_goal: FloatArray = np.zeros(2)
+        self._bumper = 0
 
     # --- Body --------------------------------------------------------------------------------------------
     def drive(self, x_vel: float, theta_vel: float) -> None:

@@ -50,7 +50,7 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.robot = LocobotSim(LocobotSimConfig(room=room, num_objects=num_objects, camera=camera))
         self._scene: Scene | None = None
         limit = np.array([MAX_X_VEL, MAX_THETA_VEL, max(Skill), _REACH, _REACH], np.float32)
-        self.action_space = gym.spaces.Box(limit * [0, -1, 0, -1, -1], limit, (len(ACTION_NAMES),), np.float32)
+        self.action_space = gym.spaces.Box(limit * np.array([0, -1, 0, -1, -1], np.float32), limit, dtype=np.float32)
         image = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         self.observation_space = gym.spaces.Dict(
             {

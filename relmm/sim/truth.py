@@ -17,8 +17,8 @@ logger = logging.getLogger(__name__)
 
 _HELD_DISTANCE = 0.045  # m between an object's centre and the point between the pads
 _HELD_HEIGHT = 0.04  # m, as in the authors' simulator
-_BASKET_SIZE = (0.072, 0.052)  # m, half the basket's inner length and width
-_BASKET_HEIGHT = (0.11, 0.25)  # m
+_BASKET_SIZE = (0.060, 0.045)  # m, half the basket's inner length and width
+_BASKET_HEIGHT = (0.11, 0.24)  # m
 _MAX_TILT = 0.94  # cosine; 20 degrees
 _FALLEN_BELOW = -0.02  # m
 

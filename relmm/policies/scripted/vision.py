@@ -16,17 +16,20 @@ OBJECT_HEIGHT = 0.015  # m, about the middle of an object: the plane onto which 
 # A median over a window that objects fill less than half of is the picture without them. Straight edges (walls, planks,
 # rugs) survive it, so only small things differ from it.
 _MEDIAN = 13  # pixels; the largest object, 4 cm at the nearest grasp cell, covers 9 x 7
-_CONTRAST = 24  # of 255; grain, joints and the shades of planks differ less from their surroundings
+_CONTRAST = 30  # of 255; grain and joints of planks rarely differ more, balls and most toys do
+_MIN_PIXELS = 2  # a single one is noise, such as a joint between walls
 _SIZE = (0.014, 0.055)  # m, diameter of a disc of a blob's area
 _MAX_LENGTH = 0.065  # m, longer side of a blob's bounding box; joints and slivers of furniture are longer
 _RING = 2  # pixels round a blob in which everything must look different from it
-_RING_SHARE = 0.85
+_RING_SHARE = 0.9
 # Patterns and the ragged edges of rugs look like many objects close together; 20 objects on 9 m^2 hardly ever do.
-_CROWD_RADIUS, _CROWD = 0.25, 4  # m, and how many within that count as a pattern
+_CROWD_RADIUS, _CROWD = 0.25, 4  # m, and how many within that, itself included, are a pattern
 
 
 def local_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """How much each pixel differs from its surroundings, in the colour channel that differs most.
+
+    The paper thresholds brightness instead, in which a yellow toy is hardly seen on a wooden floor.
 
     Args:
         image: RGB, (height, width, 3).
@@ -88,7 +91,8 @@ class _Blob:
         size = 2 * np.sqrt(self._pixels * self._pixel.prod() / np.pi)
         length = (np.array(self._box[2:]) * self._pixel).max()
         slack = self._pixel.max()
-        return bool(_SIZE[0] <= size <= _SIZE[1] + slack and length <= _MAX_LENGTH + slack)
+        enough = self._pixels >= _MIN_PIXELS
+        return bool(enough and _SIZE[0] <= size <= _SIZE[1] + slack and length <= _MAX_LENGTH + slack)
 
     def _stands_out(self) -> bool:
         """Whether it differs from everything round it, unlike the corners that a median rounds off."""
