@@ -58,7 +58,7 @@ from relmm.robot.skills import Skills
 from relmm.sim.body import SimBody
 from relmm.sim.env import RelmmRoomEnv
 from relmm.sim.objects import MAX_RADIUS
-from relmm.sim.rooms import Room, make_room, set_objects
+from relmm.sim.rooms import Room, make_room
 
 FloatArray = NDArray[np.floating]
 
@@ -117,12 +117,9 @@ class Table:
         """
         self.body.reset(rng)
         self.skills = Skills(self.body, rng)
-        self.skills.rest()
-        poses = self.body.room.scatter(rng)
-        chosen = rng.choice(len(poses), count, replace=False)
-        poses[chosen, :2] = to_world(self.body, separate_places(count, rng))
-        set_objects(self.body.model, self.body.data, poses)
-        mujoco.mj_forward(self.body.model, self.body.data)
+        chosen = rng.choice(self.body.room.num_objects, count, replace=False)
+        for index, (x, y) in zip(chosen, to_world(self.body, separate_places(count, rng)), strict=True):
+            move_object(self.body, index, x, y)
         self.body.wait(0.3)
         return self.body.truth.objects_in_robot_frame()[chosen, :2]
 
@@ -201,7 +198,7 @@ def random_navigation(room: str, episodes: int, rng: np.random.Generator) -> Cou
         for _ in range(NAVIGATION_STEPS):
             skills.navigate(*random_drive(rng))
             for index in graspable(body, out)[:PICK_UPS_PER_STEP]:
-                discard(body, index)
+                move_object(body, index, 10.0, index / 10)  # as the authors' simulator does
                 out.add(index)
         collected.add(True, len(out))
         collected.add(False, body.room.num_objects - len(out))
@@ -216,11 +213,11 @@ def graspable(body: SimBody, without: Iterable[int] = ()) -> list[int]:
     return [i for i in order if i not in without and in_grasp_area(*xyz[i, :2]) and xyz[i, 2] < 0.05]
 
 
-def discard(body: SimBody, index: int) -> None:
-    """Move an object behind the wall, where the authors' simulator puts what was collected, too."""
+def move_object(body: SimBody, index: int, x: float, y: float) -> None:
+    """Move one object (m, room) without physics, as it lies; the others may go on sleeping, which saves much time."""
     joint = body.model.body_jntadr[body.truth.object_ids[index]]
     start = body.model.jnt_qposadr[joint]
-    body.data.qpos[start : start + 2] = 10.0, index / 10
+    body.data.qpos[start : start + 2] = x, y
     mujoco.mj_forward(body.model, body.data)
 
 

@@ -22,6 +22,7 @@ from relmm.features import (
     action_dict,
 )
 from relmm.robot.locobot import LocobotRobot
+from relmm.robot.skills import REST_POSE
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.locobot_sim import LocobotSim
 from relmm.sim.rooms import set_objects
@@ -82,7 +83,7 @@ def test_the_state_is_in_the_units_of_the_vocabulary(robot: LocobotSim) -> None:
     state = robot.get_observation()
     assert state["x.vel"] == pytest.approx(0.3, abs=0.03)  # m/s
     assert state["theta.vel"] == pytest.approx(60.0, abs=6.0)  # deg/s
-    assert state["elbow.pos"] == pytest.approx(np.degrees(1.58), abs=3)  # degrees
+    assert state["elbow.pos"] == pytest.approx(np.degrees(REST_POSE[2]), abs=3)  # degrees
     assert state["gripper.pos"] == pytest.approx(0.044, abs=0.002)  # m
     assert state["holding.pos"] == state["bumper.pos"] == 0.0
 
