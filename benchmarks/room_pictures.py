@@ -1,6 +1,6 @@
 """Draws docs/rooms.png: every room from above, and through the robot's camera.
 
-    python benchmarks/room_pictures.py
+python benchmarks/room_pictures.py
 """
 
 from __future__ import annotations

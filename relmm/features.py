@@ -112,7 +112,7 @@ def outcome_features() -> dict[str, dict[str, Any]]:
         "next.success": {"dtype": "bool", **scalar},
         "complementary_info.phase": {"dtype": "int64", **scalar},  # a `Phase`
         "complementary_info.grasp_probability": {"dtype": "float32", **scalar},  # P[grasp], -1 where not asked
-        "complementary_info.robot_time": {"dtype": "float32", **scalar},  # s since the robot was connected, when the frame began
+        "complementary_info.robot_time": {"dtype": "float32", **scalar},  # s on the robot's clock, at the frame's start
     }
 
 

@@ -117,6 +117,7 @@ def evaluate(config: EvalConfig) -> None:
     """Run the episodes, print a table, and write `eval_info.json` and videos."""
     assert isinstance(config.env, RelmmRoomEnvConfig)
     assert config.policy is not None
+    assert config.output_dir is not None
     take_seed(config.policy, 0)
     actor = make_actor(config.policy)
     env = RelmmRoomEnv(**{**config.env.gym_kwargs, "render_mode": None})
@@ -130,7 +131,7 @@ def evaluate(config: EvalConfig) -> None:
     finally:
         env.close()
     print(table(scores))
-    _write(config, scores)
+    _write(config.output_dir, scores)
 
 
 def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: Path | None) -> EpisodeScore:
@@ -187,17 +188,16 @@ def table(scores: list[EpisodeScore]) -> str:
     return "\n".join(lines)
 
 
-def _write(config: EvalConfig, scores: list[EpisodeScore]) -> None:
-    assert config.output_dir is not None
-    config.output_dir.mkdir(parents=True, exist_ok=True)
+def _write(folder: Path, scores: list[EpisodeScore]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
     share = np.array([score.collected / score.total for score in scores])
     overall = {"mean_share_collected": share.mean(), "std_share_collected": share.std(), "n_episodes": len(scores)}
     overall["pc_success"] = 100 * float(np.mean(share >= SUCCESS_SHARE))
     overall["avg_sum_reward"] = float(np.mean([score.picked_up_judged for score in scores]))
     info = {"overall": overall, "per_episode": [asdict(score) for score in scores]}
-    (config.output_dir / "eval_info.json").write_text(json.dumps(info, indent=2))
-    print(f"\ncollected {share.mean():.1%} of the objects (std {share.std():.1%}); details in {config.output_dir}")
-    for video in sorted(config.output_dir.glob("videos/*.mp4")):
+    (folder / "eval_info.json").write_text(json.dumps(info, indent=2))
+    print(f"\ncollected {share.mean():.1%} of the objects (std {share.std():.1%}); details in {folder}")
+    for video in sorted(folder.glob("videos/*.mp4")):
         print(f"video: {video}")
 
 

@@ -58,9 +58,7 @@ class RelmmRoomEnvConfig(EnvConfig):
             raise ConfigError(f"env.navigation_steps is {self.navigation_steps}, but must be at least 1.")
         LocobotSimConfig(room=self.room, num_objects=self.num_objects, camera=self.camera)
 
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """As LeRobot's own, but a room whose episode has ended stands still until the slowest one has.
 
         Otherwise gymnasium starts its next episode at once, and the first reward of that one counts for the last.

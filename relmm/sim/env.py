@@ -70,9 +70,7 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._steps = self._free_grasps_used = self._judged = self._attempts = self._true_successes = 0
         return self._observe(), self._info()
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Run one skill; see the class."""
         done = self.robot.send_action(dict(zip(ACTION_NAMES, action.tolist(), strict=True)))
         reward = 0.0

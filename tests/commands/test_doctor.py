@@ -11,7 +11,8 @@ from relmm.sim.gl import choose_backend
 def test_doctor_finds_nothing_wrong_here(run):
     result = run("relmm-doctor")
     assert result.returncode == 0, result.stdout
-    assert result.stdout.count("  ok  ") == 6 and "FAIL" not in result.stdout
+    assert result.stdout.count("  ok  ") == 6
+    assert "FAIL" not in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -27,7 +28,8 @@ def test_doctor_without_opengl_says_what_to_do(run, environment):
     result = run("relmm-doctor", **environment)
     assert result.returncode == 1
     line = next(line for line in result.stdout.splitlines() if "FAIL" in line)
-    assert "rendering" in line and ("apt-get install" in line or "unset it" in line)
+    assert "rendering" in line
+    assert "apt-get install" in line or "unset it" in line
     assert "Traceback" not in result.stderr
 
 

@@ -42,9 +42,7 @@ def test_evaluate_agrees_with_lerobot_eval(run, tmp_path):
 
 
 def test_evaluate_films_the_arm_too(run, tmp_path):
-    result = run(
-        "relmm-eval", *SETTINGS, "--policy.type=relmm_random", "--eval.n_episodes=1", "--output_dir=out"
-    )
+    result = run("relmm-eval", *SETTINGS, "--policy.type=relmm_random", "--eval.n_episodes=1", "--output_dir=out")
     assert result.returncode == 0, result.stderr
     video = tmp_path / "out/videos/eval_episode_0.mp4"
     assert str(video.relative_to(tmp_path)) in result.stdout
@@ -74,7 +72,8 @@ def test_evaluate_bad_input_is_one_sentence(capsys, monkeypatch, tmp_path, bad, 
         command.main()
     errors = capsys.readouterr().err.strip()
     assert stop.value.code == 2
-    assert message in errors and "\n" not in errors
+    assert message in errors
+    assert "\n" not in errors
     assert not (tmp_path / "out").exists()
 
 

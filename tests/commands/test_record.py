@@ -77,7 +77,8 @@ def test_record_carries_what_it_picked_up_elsewhere(run, tmp_path):
     second = data["episode_index"] == 1
     phases = data["complementary_info.phase"][second]
     pseudo_reset = phases == Phase.PSEUDO_RESET
-    assert pseudo_reset.sum() == 3 + 1 + 4 + 3 and pseudo_reset[: pseudo_reset.sum()].all()
+    assert pseudo_reset.sum() == 3 + 1 + 4 + 3
+    assert pseudo_reset[: pseudo_reset.sum()].all()
     skills = data["action"][second][pseudo_reset][:, ACTION_NAMES.index("skill.pos")]
     assert skills.tolist() == [0] * 3 + [2] + [0] * 7
     assert not data["next.reward"][second][pseudo_reset].any()
@@ -98,7 +99,8 @@ def test_record_stopped_by_signal_saves_and_finishes(tmp_path, number):
         process.send_signal(number)
         output, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
-    assert "Stopping: saving what there is" in errors and "Traceback" not in errors
+    assert "Stopping: saving what there is" in errors
+    assert "Traceback" not in errors
     summary = summarize(root)
     assert f"episodes        {summary.episodes}" in output
     assert summary.episodes >= 3
@@ -134,7 +136,9 @@ def test_record_bad_input_is_one_sentence_and_writes_nothing(capsys, monkeypatch
         command.main()
     errors = capsys.readouterr().err.strip()
     assert stop.value.code == 2
-    assert message in errors and errors.startswith("relmm-record: ") and "\n" not in errors
+    assert message in errors
+    assert errors.startswith("relmm-record: ")
+    assert "\n" not in errors
     assert not root.exists()
 
 
@@ -142,7 +146,8 @@ def test_record_existing_folder_is_refused(run, tmp_path):
     (tmp_path / "room").mkdir()
     result = record(run, tmp_path / "room")
     assert result.returncode == 2
-    assert "exists already" in result.stderr and "Traceback" not in result.stderr
+    assert "exists already" in result.stderr
+    assert "Traceback" not in result.stderr
     assert not any((tmp_path / "room").iterdir())
 
 
@@ -159,5 +164,6 @@ def test_record_without_opengl_says_what_to_install(run, tmp_path):
     no_driver = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent", "MUJOCO_GL": "egl"}
     result = run("relmm-record", *SIM, *QUICK, f"--dataset.root={tmp_path / 'room'}", **no_driver)
     assert result.returncode == 2
-    assert "apt-get install" in result.stderr and "Traceback" not in result.stderr
+    assert "apt-get install" in result.stderr
+    assert "Traceback" not in result.stderr
     assert not (tmp_path / "room").exists()

@@ -53,8 +53,10 @@ def test_lerobot_record_with_scripted_teleoperator(run, tmp_path):
     assert result.returncode == 0, result.stderr
     table = pq.read_table(tmp_path / "room/data/chunk-000/file-000.parquet")
     actions, states = np.array(table["action"].to_pylist()), np.array(table["observation.state"].to_pylist())
-    assert actions.shape[1] == len(ACTION_NAMES) and states.shape[1] == len(STATE_NAMES)
-    assert len(actions) >= 5 and np.abs(actions).sum() > 0
+    assert actions.shape[1] == len(ACTION_NAMES)
+    assert states.shape[1] == len(STATE_NAMES)
+    assert len(actions) >= 5
+    assert np.abs(actions).sum() > 0
 
 
 def test_lerobot_replay(run, recorded):

@@ -1,5 +1,6 @@
 """The collection loop on the simulated robot."""
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,7 +52,9 @@ def test_episode_ends_at_its_step_limit(robot):
     loop, recorder = collector(robot, RelmmRandomConfig(device="cpu", grasp_probability=0.0))
     result = loop.episode()
     (episode,) = recorder.episodes
-    assert result.frames == len(episode) == 12 and not result.success and result.grasps == 0
+    assert result.frames == len(episode) == 12
+    assert not result.success
+    assert result.grasps == 0
     assert [outcome["next.truncated"] for _, _, outcome, _ in episode] == [False] * 11 + [True]
     assert not any(outcome["next.done"] for _, _, outcome, _ in episode)
 
@@ -74,8 +77,8 @@ def test_frames_follow_one_another_in_time(robot):
     loop.episode()
     frames = [frame for episode in recorder.episodes for frame in episode]
     times = [outcome["complementary_info.robot_time"] for _, _, outcome, _ in frames]
-    assert all(later - earlier >= 0.5 - 1e-6 for earlier, later in zip(times, times[1:], strict=False))
-    driven = [frame for frame in zip(frames, frames[1:], strict=False) if frame[0][1]["x.vel"] > 0.1]
+    assert all(later - earlier >= 0.5 - 1e-6 for earlier, later in itertools.pairwise(times))
+    driven = [frame for frame in itertools.pairwise(frames) if frame[0][1]["x.vel"] > 0.1]
     for (_, action, _, _), (after, *_rest) in driven:
         assert after["x.vel"] <= action["x.vel"] + 0.05, "the next frame shows what this frame's action did"
 
@@ -83,9 +86,12 @@ def test_frames_follow_one_another_in_time(robot):
 def test_success_ends_the_episode_and_is_carried_elsewhere(robot):
     loop, recorder = collector(robot, RelmmScriptedConfig(device="cpu"), max_steps=250)
     first, second = loop.episode(), loop.episode()
-    assert first.success and second.success
+    assert first.success
+    assert second.success
     last = recorder.episodes[0][-1]
-    assert last[1]["skill.pos"] == Skill.GRASP and last[2]["next.reward"] == 1.0 and last[2]["next.done"]
+    assert last[1]["skill.pos"] == Skill.GRASP
+    assert last[2]["next.reward"] == 1.0
+    assert last[2]["next.done"]
     phases = [outcome["complementary_info.phase"] for _, _, outcome, _ in recorder.episodes[1]]
     assert phases[:9] == [Phase.PSEUDO_RESET] * 9, "2 drives, 1 placement, 4 turns, 2 drives"
     assert set(phases[9:]) == {Phase.LEARNING}

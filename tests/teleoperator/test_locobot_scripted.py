@@ -22,7 +22,8 @@ def test_teleoperator_picks_something_up():
             skills.append(action["skill.pos"])
             if robot.get_observation()["holding.pos"]:
                 break
-        assert robot.body.truth.held() and skills[-1] == Skill.GRASP
+        assert robot.body.truth.held()
+        assert skills[-1] == Skill.GRASP
 
 
 def test_teleoperator_without_a_robot_says_what_it_needs():
