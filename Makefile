@@ -31,11 +31,11 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python $(PIP_INSTALL) -c constraints.txt -e '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## record three episodes in simulation, then evaluate the same policy
+demo: $(STAMP) ## record a scripted robot in simulation, then evaluate and film it
 	$(BIN)/relmm-record --robot.type=locobot_sim --robot.room=no_obstacles --policy.type=relmm_scripted \
-	  --dataset.repo_id=demo/no_obstacles --dataset.root=$(DEMO_DIR)/dataset --dataset.num_episodes=3 --seed=0
-	$(BIN)/relmm-eval --policy.type=relmm_scripted --env.type=relmm_room --env.room=no_obstacles \
-	  --eval.n_episodes=1 --seed=0 --output_dir=$(DEMO_DIR)/eval
+	  --dataset.repo_id=demo/no_obstacles --dataset.root=$(DEMO_DIR)/dataset --dataset.num_episodes=10 --seed=0
+	$(BIN)/relmm-eval --policy.type=relmm_scripted --env.room=no_obstacles \
+	  --eval.n_episodes=3 --seed=0 --output_dir=$(DEMO_DIR)/eval
 	@echo "the demo is in $(DEMO_DIR)"
 
 test: $(STAMP) ## run the tests, but not the slow ones
