@@ -168,7 +168,9 @@ class Room:
         material = add_material(spec, FLOOR, self.floor, np.random.default_rng(TEXTURE_SEED))
         material.texrepeat = (1 / FLOOR_TILE, 1 / FLOOR_TILE)
         material.texuniform = True  # repeats per metre instead of per geom
-        floor = add_static(spec, FLOOR, mujoco.mjtGeom.mjGEOM_PLANE, (half_x, half_y, 0.1))
+        # Under the walls, too, or the sky shows through the seam.
+        size = (half_x + WALL_THICKNESS, half_y + WALL_THICKNESS, 0.1)
+        floor = add_static(spec, FLOOR, mujoco.mjtGeom.mjGEOM_PLANE, size)
         floor.material = FLOOR
 
         half_t, half_h = WALL_THICKNESS / 2, WALL_HEIGHT / 2

@@ -14,7 +14,7 @@ from relmm.sim.textures import add_material
 OBSTACLE_PREFIX = "obstacle_"
 TIMESTEP = 0.005  # s
 SKY: Color = (0.86, 0.89, 0.92)
-RUG_THICKNESS, RUG_STEP = 0.002, 0.0005  # m
+RUG_THICKNESS, RUG_STEP = 0.0005, 0.0005  # m; thicker ones draw dotted lines along their edges
 TEXTURE_SEED = 7  # a room keeps its floor and rugs, whatever the seed that scatters the objects
 RUG_TEXTURE_SIZE = 256  # pixels a side
 NEAR_PLANE, FAR_PLANE = 0.02, 20.0  # m
@@ -80,7 +80,7 @@ def add_rug(spec: mujoco.MjSpec, rug: Rug, index: int) -> None:
     name = f"rug_{index}"
     add_material(spec, name, rug.texture, np.random.default_rng(TEXTURE_SEED), RUG_TEXTURE_SIZE)
     geom = add_static(spec, name, mujoco.mjtGeom.mjGEOM_BOX, (rug.size[0] / 2, rug.size[1] / 2, RUG_THICKNESS / 2))
-    # Without contact: a real rug gives way under wheels and balls, a rigid plate of 2 mm would be a kerb to both.
+    # Without contact: a real rug gives way under wheels and balls, a rigid plate would be a kerb to both.
     geom.contype = geom.conaffinity = 0
     # Each a little higher than the one before, so that where they overlap neither flickers through the other.
     geom.pos = (rug.x, rug.y, RUG_THICKNESS / 2 + index * RUG_STEP)
