@@ -247,11 +247,26 @@ def test_an_object_stays_held_while_driving(body: SimBody, skills: Skills) -> No
     assert body.truth.held()
 
 
-def test_the_arm_stops_where_it_meets_a_wall(body: SimBody, skills: Skills) -> None:
+def wall_force(body: SimBody) -> float:
+    """Force between the robot and the wall in front of it, N."""
+    force, total = np.zeros(6), 0.0
+    wall = body.model.geom("wall_front").id
+    for index in np.flatnonzero((body.data.contact.geom == wall).any(axis=1)):
+        mujoco.mj_contactForce(body.model, body.data, index, force)
+        total += float(force[0])
+    return total
+
+
+def test_the_arm_yields_where_it_meets_a_wall(body: SimBody, skills: Skills) -> None:
     put_robot(body, 1.5 - 0.40, 0.0, 0.0)  # farther away than where a navigation step would turn
     assert not ObstacleDetector(body.camera).obstructed(body.capture()[1])
+    forces: list[float] = []
+    body.watcher = lambda: forces.append(wall_force(body))
     assert not skills.grasp(GRASP_X[1], 0.0)
-    assert body.truth.robot()[:2] == pytest.approx((1.10, 0.0), abs=0.05), "it must not push itself off the wall"
+    body.watcher = None
+    sustained = np.convolve(forces, np.ones(5) / 5)  # over 0.1 s; the first touch is harder
+    assert 5 < sustained.max() < 60, "no more than the joints' torques can give"
+    assert body.truth.robot()[:2] == pytest.approx((1.10, 0.0), abs=0.15)
     np.testing.assert_allclose(body.state().joints, REST_POSE, atol=0.05)
 
 
