@@ -142,13 +142,15 @@ def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: P
     with progress(env.navigation_steps, "step", title, leave=False) as bar, film or nullcontext():
         ended = False
         while not ended:
+            if film is not None:
+                film.caption = _caption(info)
             action = actor.act(_robot_observation(observation))
             observation, _, terminated, truncated, info = env.step(np.array([action[n] for n in ACTION_NAMES]))
             ended = terminated or truncated
-            if film is not None:
-                film.caption = _caption(info)
             bar.set_postfix(collected=info["objects_collected"], grasps=info["grasp_attempts"], refresh=False)
             bar.update(info["navigation_steps"] - bar.n)
+        if film is not None:
+            film.caption = _caption(info)
     return EpisodeScore(
         seed=seed,
         collected=info["objects_collected"],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.configs.types import NormalizationMode
+from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.optim.optimizers import AdamConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import (
@@ -59,6 +59,13 @@ class ControllerConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.input_features:  # so that it can be made without a dataset or an environment at hand
+            self.input_features = {
+                IMAGE_KEY: PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE)),
+                STATE_KEY: PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
+            }
+        if not self.output_features:
+            self.output_features = {"action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}
         if self.num_grasp < 1:
             raise ConfigError(f"policy.num_grasp is {self.num_grasp}, but must be at least 1.")
         if self.seed is not None and self.seed < 0:

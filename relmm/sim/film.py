@@ -69,7 +69,7 @@ class Film:
 
     def _watch(self) -> None:
         if self._body.data.time >= self._next:
-            self._next = self._body.data.time + self._period
+            self._next += self._period
             self._encode(self._scene.picture(self.caption))
 
     def _encode(self, picture: NDArray[np.uint8]) -> None:
@@ -86,6 +86,7 @@ class Film:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._body.watcher = None
+        self._encode(self._scene.picture(self.caption))  # how it ended
         self._container.mux(self._stream.encode())
         self._container.close()
         self._scene.close()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.teleoperators.teleoperator import Teleoperator
 
 from relmm.errors import RobotError
@@ -13,7 +12,6 @@ from relmm.features import (
     ACTION_NAMES,
     FRONT,
     IMAGE_KEY,
-    IMAGE_SIZE,
     STATE_KEY,
     STATE_NAMES,
 )
@@ -62,15 +60,8 @@ class LocobotScripted(Teleoperator):
 
     def connect(self, calibrate: bool = True) -> None:
         """Start the controller."""
-        image = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
-        state = PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))
         self._policy = RelmmScriptedPolicy(
-            RelmmScriptedConfig(
-                input_features={IMAGE_KEY: image, STATE_KEY: state},
-                camera=self.config.camera,
-                seed=self.config.seed,
-                device="cpu",
-            )
+            RelmmScriptedConfig(camera=self.config.camera, seed=self.config.seed, device="cpu")
         )
 
     def get_action(self) -> dict[str, float]:

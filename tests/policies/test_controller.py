@@ -117,7 +117,7 @@ def test_it_does_not_learn(kind, make_controller, make_batch, empty) -> None:
 @pytest.mark.parametrize(
     ("features", "message"),
     [
-        ({}, "needs a picture .*, but there is none"),
+        ({STATE_KEY: PolicyFeature(FeatureType.STATE, (10,))}, "needs a picture .*, but there is none"),
         ({IMAGE_KEY: PolicyFeature(FeatureType.VISUAL, (3, 64, 64))}, r"but there is one of shape \(3, 64, 64\)"),
         ({IMAGE_KEY: PolicyFeature(FeatureType.VISUAL, (3, 100, 100))}, "needs observation.state to hold x.vel, "),
     ],
