@@ -59,13 +59,14 @@ class ControllerConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.input_features:  # so that it can be made without a dataset or an environment at hand
-            self.input_features = {
-                IMAGE_KEY: PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE)),
-                STATE_KEY: PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
-            }
-        if not self.output_features:
-            self.output_features = {"action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}
+        # Filled in so that a controller can be made without a dataset or an environment at hand.
+        self.input_features: dict[str, PolicyFeature] = self.input_features or {
+            IMAGE_KEY: PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE)),
+            STATE_KEY: PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
+        }
+        self.output_features: dict[str, PolicyFeature] = self.output_features or {
+            "action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))
+        }
         if self.num_grasp < 1:
             raise ConfigError(f"policy.num_grasp is {self.num_grasp}, but must be at least 1.")
         if self.seed is not None and self.seed < 0:
