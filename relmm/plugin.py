@@ -1,6 +1,7 @@
 """Registers everything that relmm adds to LeRobot and gymnasium. Importing this module is all it takes."""
 
 import relmm.policies.random.configuration_random
+import relmm.policies.relmm.configuration_relmm
 import relmm.policies.scripted.configuration_scripted
 import relmm.sim.config_locobot_sim
 import relmm.sim.config_relmm_room

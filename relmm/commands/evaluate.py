@@ -16,6 +16,7 @@ from lerobot.envs.configs import EnvConfig
 
 from relmm.commands.cli import progress, run
 from relmm.commands.policies import make_actor, policy_from_path, take_seed
+from relmm.commands.thoughts import describe_action, grasp_map
 from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES
 from relmm.learning.actor import Actor
@@ -142,15 +143,15 @@ def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: P
     with progress(env.navigation_steps, "step", title, leave=False) as bar, film or nullcontext():
         ended = False
         while not ended:
-            if film is not None:
-                film.caption = _caption(info)
             action = actor.act(_robot_observation(observation))
+            if film is not None:
+                film.caption, film.inset = _caption(info, describe_action(action)), grasp_map(actor, action)
             observation, _, terminated, truncated, info = env.step(np.array([action[n] for n in ACTION_NAMES]))
             ended = terminated or truncated
             bar.set_postfix(collected=info["objects_collected"], grasps=info["grasp_attempts"], refresh=False)
             bar.update(info["navigation_steps"] - bar.n)
         if film is not None:
-            film.caption = _caption(info)
+            film.caption = _caption(info, "the end")
     return EpisodeScore(
         seed=seed,
         collected=info["objects_collected"],
@@ -164,12 +165,11 @@ def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: P
     )
 
 
-def _caption(info: dict[str, Any]) -> str:
+def _caption(info: dict[str, Any], doing: str) -> str:
     lines = (
         f"{info['objects_collected']} of {info['objects_total']} collected",
-        f"step {info['navigation_steps']}",
-        f"{info['grasp_attempts']} grasps",
-        "4x speed",
+        f"step {info['navigation_steps']}, {info['grasp_attempts']} grasps",
+        doing,
     )
     return "\n".join(lines)
 

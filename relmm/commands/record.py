@@ -15,6 +15,7 @@ from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, summarize
 from relmm.errors import ConfigError
 from relmm.learning.actor import Actor
 from relmm.learning.collect import Collector
+from relmm.learning.life import Life
 from relmm.robot.locobot import LocobotRobot
 
 _COLLECTOR_STREAM = 2  # keeps the pseudo-resets' random numbers apart from others drawn from the same seed
@@ -131,16 +132,8 @@ def _collect(
 ) -> None:
     if recorder.repaired:
         print(recorder.repaired)
-    collector = Collector(
-        robot,
-        actor,
-        recorder,
-        clock=robot.seconds,
-        rng=np.random.default_rng([seed, _COLLECTOR_STREAM]),
-        max_steps=config.max_steps,
-        pseudo_reset_steps=config.pseudo_reset_steps,
-        should_stop=lambda: signals.stopped,
-    )
+    life = Life(robot, [recorder], robot.seconds, config.max_steps, should_stop=lambda: signals.stopped)
+    collector = Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
     frames = successes = grasps = 0
     with progress(config.dataset.num_episodes, "episode") as bar:
         while bar.n < config.dataset.num_episodes and not signals.stopped:

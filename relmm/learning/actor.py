@@ -20,34 +20,37 @@ class Actor:
     Args:
         policy: any LeRobot policy with relmm's features.
         preprocessor, postprocessor: the policy's own.
+
+    Attributes:
+        policy: as given.
     """
 
     def __init__(
         self, policy: PreTrainedPolicy, preprocessor: PolicyProcessorPipeline, postprocessor: PolicyProcessorPipeline
     ) -> None:
-        self._policy, self._preprocessor, self._postprocessor = policy, preprocessor, postprocessor
+        self.policy, self._preprocessor, self._postprocessor = policy, preprocessor, postprocessor
         policy.eval()
 
     def reset(self) -> None:
         """Begin a new episode."""
-        self._policy.reset()
+        self.policy.reset()
 
     def save_pretrained(self, folder: Path) -> None:
         """Write a folder that LeRobot's `--policy.path` takes."""
-        for part in (self._policy, self._preprocessor, self._postprocessor):
+        for part in (self.policy, self._preprocessor, self._postprocessor):
             part.save_pretrained(folder)
 
     def act(self, observation: dict[str, Any]) -> dict[str, float]:
         """The next action by name, for a robot's flat observation."""
         batch = self._preprocessor(to_batch(observation))
         with torch.inference_mode():
-            action = self._postprocessor(self._policy.select_action(batch))
+            action = self._postprocessor(self.policy.select_action(batch))
         return dict(zip(ACTION_NAMES, action.squeeze(0).tolist(), strict=True))
 
     @property
     def grasp_probability(self) -> float:
         """P[grasp] of the last decision, or -1 if the policy does not estimate it."""
-        return float(getattr(self._policy, "grasp_probability", -1.0))
+        return float(getattr(self.policy, "grasp_probability", -1.0))
 
 
 def to_batch(observation: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the controllers without weights share: LeRobot's policy interface around one decision per robot."""
+"""What relmm's policies share: LeRobot's policy interface around one decision per robot."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _HOLDING = STATE_NAMES.index("holding.pos")
 
 @dataclass
 class ControllerConfig(PreTrainedConfig):
-    """Settings that every controller has.
+    """Settings that every policy of relmm has.
 
     Args:
         seed: of its random choices; each episode draws its own stream from it, however episodes are batched. None for
@@ -73,16 +73,19 @@ class ControllerConfig(PreTrainedConfig):
             raise ConfigError(f"policy.seed is {self.seed}, but must not be negative.")
 
     @property
-    def observation_delta_indices(self) -> None:
+    def observation_delta_indices(self) -> list[int] | None:
         """Only the present observation is used."""
+        return None
 
     @property
-    def action_delta_indices(self) -> None:
+    def action_delta_indices(self) -> list[int] | None:
         """Only the present action is used."""
+        return None
 
     @property
-    def reward_delta_indices(self) -> None:
+    def reward_delta_indices(self) -> list[int] | None:
         """Only the present reward is used."""
+        return None
 
     def get_optimizer_preset(self) -> AdamConfig:
         """LeRobot asks for one; there is nothing to optimise."""
@@ -108,7 +111,7 @@ class ControllerConfig(PreTrainedConfig):
 
 @dataclass
 class Row:
-    """What a controller remembers about one robot of a batch."""
+    """What a policy remembers about one robot of a batch."""
 
     rng: np.random.Generator
     attempts: int = 0  # grasps since the last navigation step
@@ -116,7 +119,7 @@ class Row:
 
 
 class ControllerPolicy(PreTrainedPolicy):
-    """A LeRobot policy without weights that decides for one robot at a time."""
+    """A LeRobot policy that decides for one robot at a time, so that batching changes nothing."""
 
     config_class = ControllerConfig
     name = "relmm_controller"
@@ -125,8 +128,6 @@ class ControllerPolicy(PreTrainedPolicy):
     def __init__(self, config: ControllerConfig, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
-        # LeRobot looks at a policy's parameters to find its device.
-        self.placeholder = torch.nn.Parameter(torch.zeros(1), requires_grad=False)
         self._rows: list[Row] = []
         self._episodes = 0
 
@@ -166,8 +167,20 @@ class ControllerPolicy(PreTrainedPolicy):
         """A chunk of one action, (batch, 1, 5)."""
         return self.select_action(batch).unsqueeze(1)
 
+
+class UntrainedPolicy(ControllerPolicy):
+    """A policy without weights."""
+
+    config_class = ControllerConfig
+    name = "relmm_untrained"
+
+    def __init__(self, config: ControllerConfig, **kwargs: Any) -> None:
+        super().__init__(config, **kwargs)
+        # LeRobot looks at a policy's parameters to find its device.
+        self.placeholder = torch.nn.Parameter(torch.zeros(1), requires_grad=False)
+
     def forward(self, batch: dict[str, Any], **kwargs: Any) -> tuple[torch.Tensor, dict[str, Any] | None]:
-        """Controllers do not learn.
+        """There is nothing to learn.
 
         Raises:
             ConfigError: always.

@@ -15,7 +15,7 @@ from relmm.robot.skills import REST_POSE
 from relmm.sim.basket import Basket
 from relmm.sim.model import CAMERA_NAME, ROBOT, build_model
 from relmm.sim.renderer import Renderer
-from relmm.sim.rooms import Room, set_objects
+from relmm.sim.rooms import Room, set_object, set_objects
 from relmm.sim.truth import Truth
 
 _CONTROL_S = 0.02  # s between commands to the servos
@@ -79,6 +79,13 @@ class SimBody:
         self.truth = Truth(self.model, self.data, self.room)
         self.data.ctrl[self._gripper_ctrl] = MAX_OPENING / 2
         self._command_arm()
+        self.wait(_SETTLE_S)
+
+    def put_object(self, index: int, place: FloatArray) -> None:
+        """Lay one object on the floor at a place in the robot's frame, as a person would; (x, y) in m."""
+        x, y, heading = self.truth.robot()
+        rotation = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        set_object(self.model, self.data, index, (*(rotation @ place + (x, y)), heading))
         self.wait(_SETTLE_S)
 
     def _forget_commands(self) -> None:

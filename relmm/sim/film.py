@@ -16,6 +16,7 @@ from relmm.sim.renderer import Renderer, overview_camera
 
 _ROOM_SIZE = (640, 480)  # pixels
 _VIEW = 200  # pixels, side of the robot's own view, in a panel beside the room
+_INSET = 135  # pixels, side of a picture below the caption
 SIZE = (_ROOM_SIZE[0] + _VIEW, _ROOM_SIZE[1])
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -31,13 +32,22 @@ class Scene:
         self._body = body
         self._renderer = Renderer(body.model, overview_camera(body.room.size), _ROOM_SIZE)
 
-    def picture(self, caption: str = "") -> NDArray[np.uint8]:
-        """The robot's view and the room now, uint8 (480, 840, 3), with a caption of lines."""
+    def picture(self, caption: str = "", inset: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """The robot's view and the room now, uint8 (480, 840, 3).
+
+        Args:
+            caption: lines of text under the robot's view.
+            inset: a square picture under them, any size.
+        """
         panel = np.full((SIZE[1], _VIEW, 3), 24, np.uint8)
         panel[:_VIEW] = cv2.resize(self._body.capture()[0], (_VIEW, _VIEW), interpolation=cv2.INTER_NEAREST)
         for row, line in enumerate(caption.split("\n")):
-            place = (10, _VIEW + 30 + 26 * row)
-            cv2.putText(panel, line, place, _FONT, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
+            place = (10, _VIEW + 26 + 22 * row)
+            cv2.putText(panel, line, place, _FONT, 0.42, (235, 235, 235), 1, cv2.LINE_AA)
+        if inset is not None:
+            left, top = (_VIEW - _INSET) // 2, SIZE[1] - _INSET - 10
+            enlarged = cv2.resize(inset, (_INSET, _INSET), interpolation=cv2.INTER_NEAREST)
+            panel[top : top + _INSET, left : left + _INSET] = enlarged
         return np.hstack([panel, self._renderer.render(self._body.data)[0]])
 
     def close(self) -> None:
@@ -53,6 +63,9 @@ class Film:
         path: of the mp4.
         period: simulated seconds between pictures.
         fps: pictures per second when it is played; 1 / (period * fps) is slow motion, its inverse time lapse.
+
+    Attributes:
+        caption, inset: what the next pictures show beside the room; see `Scene.picture`.
     """
 
     def __init__(self, body: SimBody, path: Path, period: float = 0.2, fps: int = 20) -> None:
@@ -62,6 +75,7 @@ class Film:
         self._scene = Scene(body)
         self._next = 0.0
         self.caption = ""
+        self.inset: NDArray[np.uint8] | None = None
         path.parent.mkdir(parents=True, exist_ok=True)
         self._container = av.open(str(path), mode="w")
         self._stream = self._container.add_stream("libx264", rate=Fraction(fps), options={"crf": "23"})
@@ -70,7 +84,7 @@ class Film:
     def _watch(self) -> None:
         if self._body.data.time >= self._next:
             self._next += self._period
-            self._encode(self._scene.picture(self.caption))
+            self._encode(self._scene.picture(self.caption, self.inset))
 
     def _encode(self, picture: NDArray[np.uint8]) -> None:
         import av
@@ -86,7 +100,7 @@ class Film:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._body.watcher = None
-        self._encode(self._scene.picture(self.caption))  # how it ended
+        self._encode(self._scene.picture(self.caption, self.inset))  # how it ended
         self._container.mux(self._stream.encode())
         self._container.close()
         self._scene.close()

@@ -19,7 +19,7 @@ import importlib
 import importlib.metadata
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -194,12 +194,18 @@ def set_objects(model: mujoco.MjModel, data: mujoco.MjData, poses: FloatArray) -
         data: changed in place; positions only, so call `mj_forward` before looking.
         poses: m and rad, shape (number of objects, 3): x, y, yaw, as from `Room.scatter`.
     """
-    for index, (x, y, yaw) in enumerate(poses):
-        joint = model.joint(f"{OBJECT_PREFIX}{index:02d}")
-        start, velocity = joint.qposadr[0], joint.dofadr[0]
-        resting_height = model.qpos0[start + 2]
-        data.qpos[start : start + 7] = (x, y, resting_height, *yaw_quaternion(yaw))
-        data.qvel[velocity : velocity + 6] = 0.0
+    for index, pose in enumerate(poses):
+        set_object(model, data, index, pose)
+
+
+def set_object(model: mujoco.MjModel, data: mujoco.MjData, index: int, pose: Sequence[float] | FloatArray) -> None:
+    """Put one object of a compiled room somewhere else, at rest; as `set_objects`."""
+    x, y, yaw = pose
+    joint = model.joint(f"{OBJECT_PREFIX}{index:02d}")
+    start, velocity = joint.qposadr[0], joint.dofadr[0]
+    resting_height = model.qpos0[start + 2]
+    data.qpos[start : start + 7] = (x, y, resting_height, *yaw_quaternion(yaw))
+    data.qvel[velocity : velocity + 6] = 0.0
 
 
 # --- Registry ------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import pytest
 from relmm.commands.policies import make_actor
 from relmm.features import FREE_GRASPS, Phase, Skill
 from relmm.learning.collect import Collector
+from relmm.learning.life import Life
 from relmm.policies.random.configuration_random import RelmmRandomConfig
 from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
 from relmm.sim.config_locobot_sim import LocobotSimConfig
@@ -42,10 +43,10 @@ def robot():
 def collector(robot: LocobotSim, policy, **settings: Any) -> tuple[Collector, ListRecorder]:
     recorder = ListRecorder()
     defaults = {"max_steps": 12, "pseudo_reset_steps": 2, "should_stop": lambda: False}
-    rng = np.random.default_rng(0)
-    return Collector(
-        robot, make_actor(policy), recorder, clock=robot.seconds, rng=rng, **{**defaults, **settings}
-    ), recorder
+    settings = {**defaults, **settings}
+    pseudo_reset_steps = settings.pop("pseudo_reset_steps")
+    life = Life(robot, [recorder], robot.seconds, **settings)
+    return Collector(life, make_actor(policy), np.random.default_rng(0), pseudo_reset_steps), recorder
 
 
 def test_episode_ends_at_its_step_limit(robot):

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relmm.features import GRID
-from relmm.policies.controller import ControllerPolicy, Row, drive_anywhere, grasp_cell
+from relmm.policies.controller import Row, UntrainedPolicy, drive_anywhere, grasp_cell
 from relmm.policies.random.configuration_random import RelmmRandomConfig
 
 
-class RelmmRandomPolicy(ControllerPolicy):
+class RelmmRandomPolicy(UntrainedPolicy):
     """Drives and grasps uniformly at random."""
 
     config_class = RelmmRandomConfig
@@ -18,7 +18,7 @@ class RelmmRandomPolicy(ControllerPolicy):
     config: RelmmRandomConfig
 
     def decide(self, image: NDArray[np.uint8], row: Row) -> dict[str, float]:
-        """See `ControllerPolicy.decide`; the picture is ignored."""
+        """See `UntrainedPolicy.decide`; the picture is ignored."""
         driven = row.memory.get("driven", False)
         if driven and row.attempts == 0:
             row.memory["grasping"] = row.rng.random() < self.config.grasp_probability

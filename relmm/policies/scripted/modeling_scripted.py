@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL, MAX_X_VEL, FloatArray, action_dict, xy_to_cell
 from relmm.geometry import CameraGeometry, camera_geometry
-from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
+from relmm.policies.controller import Row, UntrainedPolicy, grasp_cell
 from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
 from relmm.policies.scripted.vision import OBJECT_HEIGHT, detect_objects
 
@@ -72,7 +72,7 @@ class _Memory:
         self.target = None if self.target is None else (self.target - shift) @ rotation
 
 
-class RelmmScriptedPolicy(ControllerPolicy):
+class RelmmScriptedPolicy(UntrainedPolicy):
     """Drives to the closest object it sees and grasps it; searches at random where there is none."""
 
     config_class = RelmmScriptedConfig
@@ -84,7 +84,7 @@ class RelmmScriptedPolicy(ControllerPolicy):
         self._camera = camera_geometry(config.camera)
 
     def decide(self, image: NDArray[np.uint8], row: Row) -> dict[str, float]:
-        """See `ControllerPolicy.decide`."""
+        """See `UntrainedPolicy.decide`."""
         memory: _Memory = row.memory.setdefault("scripted", _Memory())
         if not memory.look(detect_objects(image, self._camera), self._camera):
             _begin_leaving(memory, row.rng)

@@ -1,0 +1,30 @@
+"""The presets that are shipped with relmm, by name."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+PRESETS = ("fast", "paper", "paper_small")
+_OPTION = "--config_path="
+
+
+def preset_path(name: str) -> Path:
+    """The file of a preset."""
+    return Path(str(files("relmm.policies.relmm"))) / "presets" / f"{name}.json"
+
+
+def resolve_config_path(arguments: list[str]) -> None:
+    """Replace a preset's name after `--config_path=` by its file; a resumed run takes the settings of its checkpoint.
+
+    Args:
+        arguments: of the command line; changed in place.
+    """
+    for index, argument in enumerate(arguments):
+        if argument.removeprefix(_OPTION) in PRESETS and argument.startswith(_OPTION):
+            arguments[index] = f"{_OPTION}{preset_path(argument.removeprefix(_OPTION))}"
+    folder = next((a.partition("=")[2] for a in arguments if a.startswith("--output_dir=")), None)
+    if "--resume=true" in arguments and folder and not any(a.startswith(_OPTION) for a in arguments):
+        stored = Path(folder) / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+        if stored.is_file():
+            arguments.append(f"{_OPTION}{stored}")

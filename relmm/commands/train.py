@@ -1,0 +1,272 @@
+"""relmm-train: a robot is put into a room and learns to clean it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+from lerobot.robots.config import RobotConfig
+
+from relmm.commands.cli import StopOnSignal, progress, run
+from relmm.commands.policies import make_actor, take_seed
+from relmm.commands.presets import resolve_config_path
+from relmm.commands.train_config import TrainConfig
+from relmm.commands.train_evaluation import RoomEvaluation
+from relmm.episodes import (
+    EpisodeFollower,
+    EpisodeRecorder,
+    check_new,
+    check_trainable,
+    local_root,
+    read_episodes,
+    summarize,
+)
+from relmm.errors import ConfigError
+from relmm.learning.checkpoint import (
+    check_same_networks,
+    last_checkpoint,
+    load_training_state,
+    pretrained_model,
+    save_checkpoint,
+)
+from relmm.learning.learner import Learner
+from relmm.learning.life import Life
+from relmm.learning.progress import Metrics, Progress
+from relmm.learning.replay import Replay
+from relmm.learning.session import Schedule, Session
+from relmm.learning.trainer import Trainer
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.robot.locobot import LocobotRobot
+from relmm.sim.config_locobot_sim import LocobotSimConfig
+from relmm.sim.locobot_sim import LocobotSim
+from relmm.sim.person import Person
+
+_TRAINER_STREAM, _PERSON_STREAM = 3, 4  # keep random numbers of one seed apart
+_POLL_S = 0.5  # between looks at a dataset that is followed
+
+
+class Run:
+    """One run of relmm-train: what is made from its settings, and restored when it is resumed.
+
+    Args:
+        config: its settings.
+        signals: tell when to stop.
+    """
+
+    def __init__(self, config: TrainConfig, signals: StopOnSignal) -> None:
+        assert isinstance(config.policy, ReLMMConfig)
+        self.config, self.signals = config, signals
+        self.saved_config = draccus.encode(config, TrainConfig)  # as it was given, for a resume
+        self.checkpoint = last_checkpoint(config.checkpoints) if config.resume else None
+        if self.checkpoint is not None:
+            check_same_networks(self.checkpoint, config.policy.fingerprint())
+            config.policy.pretrained_path = pretrained_model(self.checkpoint)
+        self.actor = make_actor(config.policy)
+        policy = self.actor.policy
+        assert isinstance(policy, ReLMMPolicy)
+        self.policy = policy
+        self.replay = Replay(config.replay_frames)
+        self.learner = Learner(policy, self.replay, config.seed)
+        self.rng = np.random.default_rng([config.seed, _TRAINER_STREAM])
+        self.progress = Progress()
+
+    def load_data(self) -> None:
+        """Fill the replay: with the dataset to start from, then with the run's own, and learn what is new in them."""
+        cursor = -1
+        if self.checkpoint is not None:
+            counters = load_training_state(self.checkpoint, self.learner, self.rng)
+            cursor, self.progress.interventions = counters["episodes"], counters["interventions"]
+        if self.config.dataset.init is not None:
+            root = local_root(self.config.dataset.init)
+            check_trainable(root)
+            self._read(root, "reading the initial dataset", update_from=0 if self.checkpoint is None else None)
+        if self.checkpoint is not None:
+            root = self.config.dataset.follow or self.config.dataset_root
+            if root.exists():
+                check_trainable(root)
+                self._read(root, "reading the run's own dataset", update_from=cursor, count=True)
+
+    def _read(self, root: Path, title: str, update_from: int | None, count: bool = False) -> None:
+        total = summarize(root).episodes
+        with progress(total, "episode", title, leave=False) as bar:
+            for episode in read_episodes(root):
+                update = update_from is not None and episode.index >= update_from
+                self.learner.read(episode, update)
+                for action, reward, phase in zip(episode.actions, episode.rewards, episode.phases, strict=True):
+                    if count:
+                        self.progress.add(float(action[2]), bool(reward > 0), int(phase))
+                bar.update()
+
+    def save(self, episodes: int) -> None:
+        """Write a checkpoint.
+
+        Args:
+            episodes: of the run's dataset that the weights have learned from; a resumed run learns the later ones.
+        """
+        counters = {**self.progress.asdict(), "episodes": episodes}
+        save_checkpoint(
+            self.config.checkpoints,
+            self.progress.steps,
+            self.actor,
+            self.learner,
+            self.rng,
+            counters,
+            self.saved_config,
+        )
+
+    def session(self, save: Callable[[], None], evaluate: Callable[[], dict[str, Any]], bar: Any) -> Session:
+        """The loop with everything around it."""
+        config = self.config
+        assert config.output_dir is not None
+        schedule = Schedule(config.steps, config.log_freq, config.save_freq, config.env_eval_freq)
+
+        def show(status: dict[str, Any]) -> None:
+            curriculum = status["practice_attempts"] if status["steps"] == 0 else None
+            shown = {"objects": status["objects"], "grasps": f"{status['successes']}/{status['attempts']}"}
+            losses = {key: f"{value:.2f}" for key, value in self.learner.logs.items() if key.endswith("_loss")}
+            bar.set_postfix({"curriculum": curriculum} if curriculum else shown | losses, refresh=False)
+            bar.update(status["steps"] - bar.n)
+
+        metrics = Metrics(config.output_dir / "metrics.jsonl")
+        return Session(schedule, self.progress, self.learner, metrics, save=save, evaluate=evaluate, show=show)
+
+
+def train(config: TrainConfig) -> None:
+    """Train, and say where everything is."""
+    import torch
+
+    torch.set_num_threads(config.num_threads)
+    with StopOnSignal() as signals:
+        if config.dataset.follow is not None:
+            _train_on_stream(Run(config, signals), config.dataset.follow)
+        else:
+            _train_on_robot(Run(config, signals))
+    print(f"checkpoints, metrics and dataset: {config.output_dir}")
+
+
+def _train_on_robot(run: Run) -> None:
+    config = run.config
+    assert config.robot is not None
+    if not config.resume:
+        check_new(config.dataset_root, config.dataset.repo_id)
+    run.load_data()
+    seed = config.seed + (summarize(config.dataset_root).episodes if run.replay.episodes and config.resume else 0)
+    robot = _make_robot(replace(config.robot), seed)
+    with robot:
+        robot.get_observation()  # a robot that cannot see fails here, before anything is written
+        with _recorder(run, robot) as recorder:
+            if recorder.repaired:
+                print(recorder.repaired)
+            life = Life(
+                robot,
+                [recorder, run.replay, run.progress],
+                robot.seconds,
+                config.max_steps,
+                should_stop=lambda: run.signals.stopped,
+            )
+            trainer = Trainer(
+                life,
+                run.policy,
+                run.learner,
+                curriculum=config.curriculum.type,
+                pseudo_reset_steps=config.pseudo_reset_steps,
+                rng=run.rng,
+                put_in_reach=_person(robot, seed),
+                progress=run.progress,
+            )
+
+            def save() -> None:
+                recorder.flush()
+                run.save(recorder.saved_episodes)
+
+            with progress(config.steps, "step", "training") as bar:
+                bar.update(run.progress.steps)
+                run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
+    print(summarize(config.dataset_root))
+
+
+def _make_robot(config: RobotConfig, seed: int) -> LocobotRobot:
+    from lerobot.robots.utils import make_robot_from_config
+
+    take_seed(config, seed)
+    robot = make_robot_from_config(config)
+    if not isinstance(robot, LocobotRobot):
+        raise ConfigError(f"relmm-train needs a LoCoBot, not {config.type!r}: say --robot.type=locobot_sim.")
+    return robot
+
+
+def _recorder(run: Run, robot: LocobotRobot) -> EpisodeRecorder:
+    config, settings = run.config, run.config.robot
+    info = {key: getattr(settings, key) for key in ("room", "num_objects", "camera", "seed") if hasattr(settings, key)}
+    root = config.dataset_root
+    root.parent.mkdir(parents=True, exist_ok=True)
+    return EpisodeRecorder(
+        root,
+        config.dataset.repo_id,
+        resume=config.resume and root.exists(),
+        save_unfinished=True,
+        depth="front_depth" in robot.observation_features,
+        robot_type=robot.name,
+        info={**info, "policy": "relmm", "curriculum": config.curriculum.type},
+    )
+
+
+def _person(robot: LocobotRobot, seed: int) -> Callable[[], bool]:
+    if isinstance(robot, LocobotSim):
+        return Person(robot.body, np.random.default_rng([seed, _PERSON_STREAM])).put_in_reach
+    return lambda: False
+
+
+def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
+    settings = run.config.robot
+    if not isinstance(settings, LocobotSimConfig):
+        return dict
+    assert run.config.output_dir is not None
+    evaluation = RoomEvaluation(settings, run.actor, run.config.eval, run.config.output_dir / "eval")
+
+    def evaluate() -> dict[str, Any]:
+        scores = evaluation(run.progress.steps)
+        bar.write(f"step {run.progress.steps}: collected {scores['eval_collected']:.1%} of the objects")
+        return scores
+
+    return evaluate
+
+
+def _train_on_stream(run: Run, root: Path) -> None:
+    config = run.config
+    run.load_data()
+    read = summarize(root).episodes if config.resume else 0
+    follower = EpisodeFollower(root, read)
+
+    def episodes() -> Iterator[Any]:
+        nonlocal read
+        while not run.signals.stopped:
+            batch = follower.poll()
+            for episode in batch:
+                read = episode.index + 1
+                yield episode
+                if run.signals.stopped:
+                    return
+            if not batch:
+                time.sleep(_POLL_S)
+
+    with progress(config.steps, "step", f"following {root}") as bar:
+        bar.update(run.progress.steps)
+        run.session(lambda: run.save(read), dict, bar).follow(episodes())
+
+
+def main() -> None:
+    """Entry point of `relmm-train`."""
+    resolve_config_path(sys.argv)
+    run("relmm-train", TrainConfig, train)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""Settings of relmm-train."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.robots.config import RobotConfig
+
+from relmm.commands.policies import policy_from_path
+from relmm.episodes import check_repo_id
+from relmm.errors import ConfigError
+from relmm.learning.curriculum import CURRICULA
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+
+
+@dataclass
+class TrainDatasetConfig:
+    """Where the robot's life is kept, and what is learned from besides.
+
+    Args:
+        repo_id: name of the dataset, `user/name`.
+        root: its folder; None for `dataset` in the output folder.
+        init: a dataset (folder, or user/name on the Hub) to fill the replay with and train on first.
+        follow: a dataset that another process is recording; there is no robot then.
+    """
+
+    repo_id: str = "local/relmm"
+    root: Path | None = None
+    init: str | None = None
+    follow: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_repo_id(self.repo_id)
+
+
+@dataclass
+class CurriculumConfig:
+    """What comes before, or at the beginning of, learning to navigate; its numbers are in the policy's config.
+
+    Args:
+        type: `stationary` (an object in front of the robot, Algorithm 1), `autonomous` (Algorithms 3 and 4) or `none`.
+    """
+
+    type: str = "stationary"
+
+    def __post_init__(self) -> None:
+        if self.type not in CURRICULA:
+            raise ConfigError(f"curriculum.type is {self.type!r}: choose one of {', '.join(CURRICULA)}.")
+
+
+@dataclass
+class TrainEvalConfig:
+    """Evaluation while training.
+
+    Args:
+        n_episodes: episodes each time, of the seeds `seed`, `seed` + 1, ...
+        seed: of the first one.
+        n_videos: how many of them to film, from the first on.
+    """
+
+    n_episodes: int = 3
+    seed: int = 1000
+    n_videos: int = 0
+
+    def __post_init__(self) -> None:
+        if self.n_episodes < 1:
+            raise ConfigError(f"eval.n_episodes is {self.n_episodes}, but must be at least 1.")
+        if min(self.seed, self.n_videos) < 0:
+            raise ConfigError("eval.seed and eval.n_videos must not be negative.")
+
+
+@dataclass
+class TrainConfig:
+    """Train ReLMM online on a robot.
+
+    Args:
+        robot: `--robot.type=locobot_sim --robot.room=...`; not with `--dataset.follow`.
+        dataset: where the robot's life is kept, and what is learned from besides.
+        policy: `--policy.type=relmm` and its hyper-parameters, or `--policy.path` to go on from.
+        curriculum: `--curriculum.type=stationary`, `autonomous` or `none`.
+        eval: evaluation while training.
+        steps: navigation steps to train for, those of earlier runs included.
+        seed: of everything random; equal seeds give equal runs.
+        output_dir: a folder that does not exist yet; None for outputs/train/DATE/TIME_JOB.
+        job_name: last part of that folder's name.
+        resume: go on with the run in `output_dir`.
+        env_eval_freq: navigation steps between evaluations; 0 for none.
+        save_freq: navigation steps between checkpoints.
+        log_freq: navigation steps between lines of `metrics.jsonl`.
+        max_steps: navigation steps after which an episode is cut off.
+        pseudo_reset_steps: random navigation steps before and after a picked-up object is put down again.
+        replay_frames: frames to learn from that are kept in memory, 30 kB each.
+        num_threads: of torch; 1 is the fastest on few cores.
+    """
+
+    robot: RobotConfig | None = None
+    dataset: TrainDatasetConfig = field(default_factory=TrainDatasetConfig)
+    policy: PreTrainedConfig | None = None
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
+    steps: int = 2000
+    seed: int = 0
+    output_dir: Path | None = None
+    job_name: str = "relmm"
+    resume: bool = False
+    env_eval_freq: int = 500
+    save_freq: int = 500
+    log_freq: int = 50
+    max_steps: int = 250
+    pseudo_reset_steps: int = 20
+    replay_frames: int = 100_000
+    num_threads: int = 1
+
+    def __post_init__(self) -> None:
+        self.policy = policy_from_path(self.policy or ReLMMConfig())
+        if not isinstance(self.policy, ReLMMConfig):
+            raise ConfigError(f"relmm-train trains --policy.type=relmm, not {self.policy.type}.")
+        for name, least in _LEAST.items():
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} is {getattr(self, name)}, but must be at least {least}.")
+        if (self.robot is None) == (self.dataset.follow is None):
+            raise ConfigError(
+                "Say what to learn from: either a robot (--robot.type=locobot_sim) or a dataset that another process "
+                "records (--dataset.follow=FOLDER)."
+            )
+        camera = getattr(self.robot, "camera", self.policy.camera)
+        if camera != self.policy.camera:
+            raise ConfigError(
+                f"robot.camera is {camera!r} but policy.camera is {self.policy.camera!r}: the policy must know the "
+                f"robot's camera; add --policy.camera={camera}."
+            )
+        if self.policy.seed is None:
+            self.policy.seed = self.seed
+        self._choose_folder()
+
+    def _choose_folder(self) -> None:
+        if self.output_dir is None:
+            if self.resume:
+                raise ConfigError("Say which run to go on with: --resume=true --output_dir=FOLDER.")
+            now = datetime.now()
+            self.output_dir = Path("outputs/train") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{self.job_name}"
+        if not self.resume and self.output_dir.exists():
+            raise ConfigError(
+                f"{self.output_dir} exists already: choose another --output_dir, or go on with --resume=true."
+            )
+
+    @property
+    def checkpoints(self) -> Path:
+        """The run's checkpoints."""
+        assert self.output_dir is not None
+        return self.output_dir / "checkpoints"
+
+    @property
+    def dataset_root(self) -> Path:
+        """The folder of the robot's life."""
+        assert self.output_dir is not None
+        return self.dataset.root or self.output_dir / "dataset"
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """The fields that LeRobot's parser lets be loaded with `.path`."""
+        return ["policy"]
+
+
+_LEAST = {
+    "steps": 1,
+    "seed": 0,
+    "env_eval_freq": 0,
+    "save_freq": 1,
+    "log_freq": 1,
+    "max_steps": 1,
+    "pseudo_reset_steps": 0,
+    "replay_frames": 1000,
+    "num_threads": 1,
+}

@@ -1,0 +1,147 @@
+"""Checkpoints in LeRobot's tree, written so that a crash at any instant leaves the last one whole.
+
+    checkpoints/<step>/pretrained_model/   the policy and its processors; what --policy.path takes
+    checkpoints/<step>/training_state/     optimisers, random states, counters and the dataset cursor
+    checkpoints/last                       a link to the newest
+
+The replay is not in there: the dataset is the replay.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import load_file, save_file
+
+from relmm.errors import ConfigError
+from relmm.learning.actor import Actor
+from relmm.learning.learner import Learner
+
+_MODEL, _STATE, _LAST = "pretrained_model", "training_state", "last"
+_COUNTERS, _RANDOM = "relmm_state.json", "relmm_rng.safetensors"
+
+
+def save_checkpoint(
+    folder: Path, step: int, actor: Actor, learner: Learner, rng: Any, counters: dict[str, Any], config: dict[str, Any]
+) -> Path:
+    """Write `folder/<step>` and point `folder/last` to it.
+
+    Args:
+        folder: the run's `checkpoints`.
+        step: navigation steps so far.
+        actor: the policy with its processors.
+        learner: its optimisers and random states.
+        rng: the trainer's numpy generator.
+        counters: of the run; JSON values.
+        config: of the run, for `train_config.json`.
+
+    Returns:
+        The checkpoint's folder.
+    """
+    from lerobot.common.train_utils import save_training_state
+
+    target, temporary = folder / f"{step:06d}", folder / f".{step:06d}.tmp"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    actor.save_pretrained(temporary / _MODEL)
+    _write_json(temporary / _MODEL / "train_config.json", config)
+    save_training_state(temporary, step, learner.optimizers)
+    states = {"trainer": rng.bit_generator.state, "learner": learner.rng.bit_generator.state}
+    _write_json(temporary / _STATE / _COUNTERS, {"counters": counters, "random": states})
+    generators = {"policy": learner.policy.rng.get_state(), "noise": learner.noise.get_state()}
+    save_file(generators, temporary / _STATE / _RANDOM)
+    _sync_tree(temporary)
+    if target.exists():  # the same step again, after a resume from an older checkpoint
+        shutil.rmtree(target)
+    os.replace(temporary, target)
+    _link(folder / _LAST, target.name)
+    return target
+
+
+def last_checkpoint(folder: Path) -> Path:
+    """The newest checkpoint of a run's `checkpoints` folder.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    last = folder / _LAST
+    if not (last / _MODEL / "config.json").is_file():
+        raise ConfigError(f"There is no checkpoint in {folder}: check the folder, or train without --resume.")
+    return last.resolve()
+
+
+def pretrained_model(checkpoint: Path) -> Path:
+    """The folder of a checkpoint that `--policy.path` takes."""
+    return checkpoint / _MODEL
+
+
+def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[str, Any]:
+    """Restore what `save_checkpoint` wrote, but for the weights, and give back the counters.
+
+    Raises:
+        ConfigError: the checkpoint is of a policy with other networks, or damaged.
+    """
+    from lerobot.optim import load_optimizer_state
+
+    try:
+        load_optimizer_state(learner.optimizers, checkpoint / _STATE)
+        state = json.loads((checkpoint / _STATE / _COUNTERS).read_text(encoding="utf-8"))
+        generators = load_file(checkpoint / _STATE / _RANDOM)
+        learner.policy.rng.set_state(generators["policy"])
+        learner.noise.set_state(generators["noise"])
+        rng.bit_generator.state = state["random"]["trainer"]
+        learner.rng.bit_generator.state = state["random"]["learner"]
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"The training state in {checkpoint} cannot be read ({reason}); resume another.") from error
+    counters: dict[str, Any] = state["counters"]
+    return counters
+
+
+def _write_json(path: Path, data: Any) -> None:
+    path.write_text(json.dumps(data, indent=4), encoding="utf-8")
+
+
+def _link(link: Path, target: str) -> None:
+    temporary = link.with_name(f".{link.name}.tmp")
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(target)
+    os.replace(temporary, link)
+    _sync(link.parent)
+
+
+def _sync_tree(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        _sync(path)
+    _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def check_same_networks(checkpoint: Path, wanted: dict[str, Any]) -> None:
+    """Refuse a checkpoint whose networks differ from those of this run.
+
+    Args:
+        checkpoint: its folder.
+        wanted: `ReLMMConfig.fingerprint` of this run.
+
+    Raises:
+        ConfigError: with the differences.
+    """
+    have = json.loads((checkpoint / _MODEL / "config.json").read_text(encoding="utf-8"))
+    differences = [f"{key} is {have.get(key)}, not {value}" for key, value in wanted.items() if have.get(key) != value]
+    if differences:
+        raise ConfigError(
+            f"The checkpoint {checkpoint} is of another preset ({'; '.join(differences)}): resume it with its own "
+            "train_config.json, or train into a new folder."
+        )

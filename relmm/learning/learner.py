@@ -1,0 +1,132 @@
+"""Updates of the policy from the replay: sample, relabel, loss, step."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from relmm.learning.maps import Maps, to_pictures
+from relmm.learning.replay import Replay
+from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.policies.relmm.navigation import ACTIONS, NavigationBatch
+
+
+class RecordedEpisode(Protocol):
+    """What `relmm.episodes` reads: a row a frame."""
+
+    images: NDArray[np.uint8]
+    actions: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    phases: NDArray[np.int64]
+
+
+class Learner:
+    """Trains a policy's two modules, each with its own optimiser.
+
+    Args:
+        policy: to train; its config says how.
+        replay: to learn from.
+        seed: of the batches.
+
+    Attributes:
+        optimizers: by module.
+        logs: of the last updates, for the metrics.
+    """
+
+    def __init__(self, policy: ReLMMPolicy, replay: Replay, seed: int) -> None:
+        self.policy, self.replay, self.config = policy, replay, policy.config
+        self.maps = Maps(policy, replay)
+        self.rng = np.random.default_rng(seed)
+        self.noise = torch.Generator().manual_seed(seed)
+        grasping, navigation = policy.get_optim_params()
+        self.optimizers = {
+            "grasping": torch.optim.Adam(grasping["params"], lr=grasping["lr"], fused=True),
+            "navigation": torch.optim.Adam(navigation["params"], lr=navigation["lr"], fused=True),
+        }
+        self.logs: dict[str, float] = {}
+        policy.train()
+
+    # --- Grasping -----------------------------------------------------------------------------------------
+    @property
+    def grasping_has_begun(self) -> bool:
+        """Whether there are N_bt attempts; until then the ensemble knows nothing."""
+        return len(self.replay.attempts) >= self.config.min_attempts_to_update
+
+    def update_grasping(self) -> None:
+        """The updates that follow an attempt, if there are enough attempts to learn from."""
+        if self.grasping_has_begun:
+            for _ in range(self.config.grasp_updates):
+                self._step("grasping", *self._grasp_loss())
+            self.maps.version += 1
+
+    def _grasp_loss(self) -> tuple[torch.Tensor, dict[str, float]]:
+        attempts = self.replay.attempts
+        rows = self.replay.sample(attempts, self.config.grasp_batch_size, self.rng)
+        device = self.policy.weights_device
+        pictures = to_pictures(self.replay.pictures(attempts["frame"][rows]), device)
+        cells = torch.from_numpy(attempts["cell"][rows]).to(device)
+        successes = torch.from_numpy(attempts["success"][rows]).to(device)
+        loss = self.policy.grasping.loss(pictures, cells, successes)
+        return loss, {"grasp_loss": loss.item() / self.config.num_members}
+
+    # --- Recorded episodes --------------------------------------------------------------------------------
+    def read(self, episode: RecordedEpisode, update: bool) -> None:
+        """Take a recorded episode into the replay; with `update`, learn from each frame as if it had just happened."""
+        for picture, action, reward, phase in zip(
+            episode.images, episode.actions, episode.rewards, episode.phases, strict=True
+        ):
+            attempts, steps = len(self.replay.attempts), self.replay.navigation_steps
+            self.replay.add(picture, action, bool(reward > 0), int(phase))
+            if update and len(self.replay.attempts) > attempts:
+                self.update_grasping()
+            if update and self.replay.navigation_steps > steps:
+                self.update_navigation()
+        self.replay.save_episode()
+
+    # --- Navigation ---------------------------------------------------------------------------------------
+    def update_navigation(self) -> None:
+        """The updates that follow a navigation step, if there are enough steps to learn from."""
+        if len(self.replay.steps) >= self.config.min_steps_to_update:
+            for _ in range(self.config.navigation_updates):
+                self._step("navigation", *self._navigation_loss())
+                self.policy.update()
+
+    def _navigation_loss(self) -> tuple[torch.Tensor, dict[str, float]]:
+        size, replay = self.config.navigation_batch_size, self.replay
+        others = round(size * self.config.pseudo_reset_share) if len(replay.pseudo_reset_steps) else 0
+        rows = replay.steps.rows(replay.sample(replay.steps, size - others, self.rng))
+        if others:
+            chosen = replay.sample(replay.pseudo_reset_steps, others, self.rng)
+            more = replay.pseudo_reset_steps.rows(chosen)
+            rows = {name: np.concatenate([rows[name], more[name]]) for name in rows}
+        batch = self.navigation_batch(rows)
+        if self.config.mirror and self.rng.random() < 0.5:
+            batch = batch.mirrored()
+        noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)
+        return self.policy.navigation.loss(batch, noise)
+
+    def navigation_batch(self, steps: dict[str, NDArray[Any]]) -> NavigationBatch:
+        """Rows of navigation steps as a batch, relabelled by the current ensemble."""
+        device, count = self.policy.weights_device, len(steps["frame"])
+        frames = np.concatenate([steps["frame"], steps["next"]])
+        observations, probabilities = self.maps.get(frames, self.config.refreshed_maps)
+        success = torch.from_numpy(steps["success"]).to(device)
+        actions = np.stack([steps["forward"], steps["turn"]], axis=1)
+        batch = NavigationBatch(
+            observations[:count],
+            torch.from_numpy(actions).to(device),
+            success.float() - 1,
+            observations[count:],
+            1 - success.float(),
+        )
+        return self.policy.relabel(batch, probabilities[count:], ~success)
+
+    def _step(self, module: str, loss: torch.Tensor, logs: dict[str, float]) -> None:
+        optimizer = self.optimizers[module]
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        self.logs |= logs

@@ -1,0 +1,131 @@
+"""A robot's life, frame by frame: act, look, judge, and hand the frame to whoever keeps it.
+
+An episode begins with the pseudo-reset after the last success, if there was one, and ends with a success or at a step
+limit. So its last frame is the only one that is done or truncated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from lerobot.robots.robot import Robot
+
+from relmm.features import FREE_GRASPS, Phase, Skill
+from relmm.learning.actor import TASK
+
+
+class Recorder(Protocol):
+    """Where frames go; `relmm.episodes.EpisodeRecorder` and `relmm.learning.replay.Replay` are two."""
+
+    def add_frame(
+        self, observation: dict[str, Any], action: dict[str, float], outcome: dict[str, Any], task: str
+    ) -> None:
+        """Take one frame."""
+
+    def save_episode(self) -> None:
+        """End the episode."""
+
+
+@dataclass
+class EpisodeResult:
+    """What happened in one episode.
+
+    Attributes:
+        frames: recorded, pseudo-reset included.
+        grasps: attempts.
+        steps: that count towards the limit: navigation steps, and attempts beyond two in a row.
+        success: whether it ended with something in the gripper.
+    """
+
+    frames: int = 0
+    grasps: int = 0
+    steps: int = 0
+    success: bool = False
+
+
+class Life:
+    """Acts on a robot and keeps a record.
+
+    Args:
+        robot: connected.
+        recorders: take the frames.
+        clock: seconds on the robot's own clock.
+        max_steps: after which an episode is cut off.
+        should_stop: asked after every frame; the episode is then cut off and saved.
+
+    Attributes:
+        observation: the robot's last.
+        episode: what has happened in the running episode.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        recorders: Sequence[Recorder],
+        clock: Callable[[], float],
+        max_steps: int,
+        should_stop: Callable[[], bool],
+    ) -> None:
+        self._robot, self._recorders, self._clock = robot, recorders, clock
+        self._max_steps, self.should_stop = max_steps, should_stop
+        self._grasps_in_a_row = 0
+        self.observation: dict[str, Any] = robot.get_observation()
+        self.episode = EpisodeResult()
+
+    @property
+    def holding(self) -> bool:
+        """Whether the robot believes that it holds something."""
+        return bool(self.observation["holding.pos"] > 0.5)
+
+    def look_again(self) -> None:
+        """Take a new observation, after someone else has changed the room."""
+        self.observation = self._robot.get_observation()
+
+    def step(self, action: dict[str, float], phase: Phase, grasp_probability: float = -1.0) -> bool:
+        """Act, look, record.
+
+        Args:
+            action: one skill.
+            phase: why.
+            grasp_probability: P[grasp] of the observation before, -1 if nobody asked.
+
+        Returns:
+            Whether the episode has ended with this frame; its result is then in `last_episode`.
+        """
+        before, seconds = self.observation, self._clock()
+        done_action = self._robot.send_action(action)
+        self.observation = self._robot.get_observation()
+        grasped = done_action["skill.pos"] == Skill.GRASP
+        self._count(grasped, phase)
+        success = grasped and self.holding
+        truncated = not success and (self.episode.steps >= self._max_steps or self.should_stop())
+        outcome = {
+            "next.reward": float(success),
+            "next.done": success,
+            "next.truncated": truncated,
+            "next.success": success,
+            "complementary_info.phase": int(phase),
+            "complementary_info.grasp_probability": grasp_probability,
+            "complementary_info.robot_time": seconds,
+        }
+        for recorder in self._recorders:
+            recorder.add_frame(before, done_action, outcome, TASK)
+        if success or truncated:
+            self._end_episode(success)
+        return success or truncated
+
+    def _count(self, grasped: bool, phase: Phase) -> None:
+        self._grasps_in_a_row = self._grasps_in_a_row + 1 if grasped else 0
+        counts = phase == Phase.CURRICULUM or (phase == Phase.LEARNING and not 0 < self._grasps_in_a_row <= FREE_GRASPS)
+        self.episode.frames += 1
+        self.episode.grasps += grasped
+        self.episode.steps += counts
+
+    def _end_episode(self, success: bool) -> None:
+        for recorder in self._recorders:
+            recorder.save_episode()
+        self.episode.success = success
+        self.last_episode, self.episode = self.episode, EpisodeResult()
+        self._grasps_in_a_row = 0

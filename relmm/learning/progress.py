@@ -1,0 +1,93 @@
+"""How far a run has come, counted from its frames, and the file of its metrics."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from relmm.features import Phase, Skill
+
+
+@dataclass
+class Progress:
+    """Counts of a run; a resumed run counts the frames of its dataset again, so none is lost.
+
+    Attributes:
+        steps: navigation steps chosen by the policy (the paper's unit; those of pseudo-resets do not count).
+        practice_attempts: grasps of a curriculum.
+        attempts, successes: grasps in all, and those that picked something up.
+        objects: picked up outside a curriculum.
+        pseudo_reset_steps: navigation steps of pseudo-resets.
+        interventions: times that a person had to put an object into reach.
+    """
+
+    steps: int = 0
+    practice_attempts: int = 0
+    attempts: int = 0
+    successes: int = 0
+    objects: int = 0
+    pseudo_reset_steps: int = 0
+    interventions: int = 0
+
+    def add_frame(
+        self, observation: dict[str, Any], action: dict[str, float], outcome: dict[str, Any], task: str
+    ) -> None:
+        """Take one frame, as `relmm.episodes.EpisodeRecorder.add_frame` does."""
+        self.add(action["skill.pos"], outcome["next.reward"] > 0, outcome["complementary_info.phase"])
+
+    def add(self, skill: float, success: bool, phase: int) -> None:
+        """Count one frame."""
+        grasped, drove = round(skill) == Skill.GRASP, round(skill) == Skill.NAVIGATE
+        self.steps += drove and phase == Phase.LEARNING
+        self.practice_attempts += grasped and phase == Phase.CURRICULUM
+        self.attempts += grasped
+        self.successes += bool(success)
+        self.objects += bool(success) and phase == Phase.LEARNING
+        self.pseudo_reset_steps += drove and phase == Phase.PSEUDO_RESET
+
+    def save_episode(self) -> None:
+        """Nothing to do."""
+
+    def asdict(self) -> dict[str, int]:
+        """By name, for logs."""
+        return asdict(self)
+
+
+class Metrics:
+    """A `metrics.jsonl`: one JSON object a line, on the disk when `write` returns.
+
+    Args:
+        path: of the file; appended to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torn = path.exists() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
+        self._file = path.open("a", encoding="utf-8")
+        if torn:  # a killed run may have left half a line
+            self._file.write("\n")
+
+    def write(self, **values: Any) -> None:
+        """Add a line."""
+        rounded = {key: round(value, 5) if isinstance(value, float) else value for key, value in values.items()}
+        self._file.write(json.dumps(rounded) + "\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a `metrics.jsonl`; half a line that a killed run has left is skipped."""
+    lines = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            continue
+    return lines

@@ -1,0 +1,37 @@
+"""The pseudo-reset (paper 4.3): carry what was picked up to somewhere else, put it down there, and drive away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from relmm.features import MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict
+
+_PLACE_XY = (0.40, 0.0)  # m, where the object is put down, as in the authors' code
+_TURN_AWAY_STEPS = 4  # 108 degrees, so that driving on does not push what was just put down
+
+
+def drive_anywhere(rng: np.random.Generator) -> dict[str, float]:
+    """A navigation step drawn uniformly from all of them."""
+    x_vel, theta_vel = rng.uniform((0.0, -MAX_THETA_VEL), (MAX_X_VEL, MAX_THETA_VEL))
+    return action_dict(x_vel=float(x_vel), theta_vel=float(theta_vel))
+
+
+def pseudo_reset(rng: np.random.Generator, steps: int, holding: Callable[[], bool]) -> Iterator[dict[str, float]]:
+    """The actions of a pseudo-reset.
+
+    Args:
+        rng: of the drives.
+        steps: random navigation steps before and after the object is put down.
+        holding: whether something is in the gripper now; it may be lost on the way.
+    """
+    for _ in range(steps):
+        yield drive_anywhere(rng)
+    if holding():
+        yield action_dict(Skill.PLACE, x=_PLACE_XY[0], y=_PLACE_XY[1])
+    direction = float(rng.choice((-1.0, 1.0)))
+    for _ in range(_TURN_AWAY_STEPS):
+        yield action_dict(theta_vel=direction * MAX_THETA_VEL)
+    for _ in range(steps):
+        yield drive_anywhere(rng)

@@ -1,0 +1,111 @@
+"""A training session: the trainer's loop with its evaluations, checkpoints and metrics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from relmm.learning.learner import Learner, RecordedEpisode
+from relmm.learning.progress import Metrics, Progress
+from relmm.learning.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When to do what, in navigation steps.
+
+    Attributes:
+        steps: the end.
+        log_freq, save_freq: between lines of the metrics, and between checkpoints.
+        eval_freq: between evaluations; 0 for none.
+    """
+
+    steps: int
+    log_freq: int
+    save_freq: int
+    eval_freq: int
+
+
+class Session:
+    """Does what is due after each navigation step.
+
+    Args:
+        schedule: when to do what.
+        progress: counts of the run.
+        learner: whose losses are logged.
+        metrics: takes them.
+        save: writes a checkpoint.
+        evaluate: the scores of the policy as it is.
+        show: tells the user, after every attempt and step.
+    """
+
+    def __init__(
+        self,
+        schedule: Schedule,
+        progress: Progress,
+        learner: Learner,
+        metrics: Metrics,
+        *,
+        save: Callable[[], None],
+        evaluate: Callable[[], dict[str, Any]],
+        show: Callable[[dict[str, Any]], None],
+    ) -> None:
+        self._schedule, self._progress, self._learner, self._metrics = schedule, progress, learner, metrics
+        self._save, self._evaluate, self._show = save, evaluate, show
+        self._started = time.monotonic()
+        self._saved_at = -1
+
+    def live(self, trainer: Trainer, should_stop: Callable[[], bool]) -> None:
+        """Train on a robot until the last step, or until told to stop; ends with a checkpoint."""
+        self._begin()
+        while trainer.in_stationary_curriculum and not should_stop():
+            trainer.stationary_attempt()
+            self._show(self._status())
+        while self._progress.steps < self._schedule.steps and not should_stop():
+            before = self._progress.steps
+            trainer.navigation_step()
+            self._after(before)
+        self._checkpoint()
+
+    def follow(self, episodes: Iterable[RecordedEpisode]) -> None:
+        """Train on episodes that come in from elsewhere, until the last step or the last of them."""
+        self._begin()
+        for episode in episodes:
+            before = self._progress.steps
+            for action, reward, phase in zip(episode.actions, episode.rewards, episode.phases, strict=True):
+                self._progress.add(float(action[2]), bool(reward > 0), int(phase))
+            self._learner.read(episode, update=True)
+            self._progress.save_episode()
+            self._after(before, save=True)
+            if self._progress.steps >= self._schedule.steps:
+                break
+        self._checkpoint()
+
+    def _begin(self) -> None:
+        if self._progress.attempts + self._progress.steps == 0:
+            self._checkpoint()  # so that a run that is killed at once can be resumed, and recorders find a policy
+
+    def _after(self, before: int, save: bool = False) -> None:
+        schedule, step = self._schedule, self._progress.steps
+        self._show(self._status())
+        if _passed(before, step, schedule.log_freq):
+            self._metrics.write(**self._status(), **self._learner.logs)
+        if _passed(before, step, schedule.eval_freq):
+            self._metrics.write(**self._status(), **self._evaluate())
+        if save or _passed(before, step, schedule.save_freq):
+            self._checkpoint()
+
+    def _checkpoint(self) -> None:
+        if self._saved_at != self._progress.steps:
+            self._save()
+            self._saved_at = self._progress.steps
+
+    def _status(self) -> dict[str, Any]:
+        return {**self._progress.asdict(), "seconds": round(time.monotonic() - self._started, 1)}
+
+
+def _passed(before: int, now: int, every: int) -> bool:
+    """Whether a multiple of `every` lies after `before` and up to `now`; 0 is never."""
+    return every > 0 and now // every > before // every

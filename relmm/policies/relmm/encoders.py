@@ -1,0 +1,125 @@
+"""What navigation sees: pictures as in the paper, or a map of the floor with the grasp ensemble's opinion of it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from relmm.features import GRID, IMAGE_SIZE
+from relmm.geometry import camera_geometry
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.relmm.floor import FloorView
+from relmm.policies.relmm.grasping import GraspEnsemble, RectifiedBackbone
+
+# A pixel of the navigation map is 5x5 grasp cells, 5.5 cm: the grasp area is 3x3 pixels. The map reaches 1.78 m ahead
+# and 0.88 m to either side; farther off, an object is less than two pixels of the picture.
+_CELLS = 5
+_ROWS, _COLUMNS = 32, 33
+_NEAR_ROWS = 1  # pixels of the map before the grasp area
+_JUDGED_ROWS = 20  # of them, up to 1.36 m, get a grasp probability; farther off a picture shows too little
+_MAP_MEMBERS = 1  # of the ensemble, that draw the map
+
+
+class PictureObserver(nn.Module):
+    """The paper's observation: the picture itself."""
+
+    shape = (3, IMAGE_SIZE, IMAGE_SIZE)
+
+    def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
+        """Pictures 0..1 as uint8, (batch, 3, 100, 100); the ensemble is not asked."""
+        return (images * 255).round().to(torch.uint8)
+
+
+class FloorObserver(nn.Module):
+    """A map of the floor: where a grasp would succeed, and its colours.
+
+    The ensemble is fully convolutional, so it can judge floor that the arm does not reach yet: navigation gets a map of
+    graspable things that was learned from grasps alone.
+
+    Args:
+        config: of the policy.
+    """
+
+    shape = (4, _ROWS, _COLUMNS)
+
+    def __init__(self, config: ReLMMConfig) -> None:
+        super().__init__()
+        camera = camera_geometry(config.camera)
+        row, column = -_NEAR_ROWS * _CELLS, -(_COLUMNS * _CELLS - GRID) // 2
+        margin = 4  # cells that the networks see around one
+        rows, columns = _ROWS * _CELLS, _COLUMNS * _CELLS
+        self._margin = margin
+        self.view = FloorView(camera, row - margin, column - margin, rows + 2 * margin, columns + 2 * margin)
+        visible = (self.view.grid.abs() <= 1).all(dim=-1)[margin:-margin, margin:-margin][: _JUDGED_ROWS * _CELLS]
+        self.visible: Tensor
+        self.register_buffer("visible", visible, persistent=False)
+
+    @torch.no_grad()
+    def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
+        """Grasp probability (the highest in each pixel) and RGB (their mean), uint8, (batch, 4, 32, 33)."""
+        assert isinstance(grasping.backbone, RectifiedBackbone)
+        floor = self.view(images)
+        judged = floor[:, :, : _JUDGED_ROWS * _CELLS + 2 * self._margin]
+        logits = grasping.backbone.on_map(judged, members=_MAP_MEMBERS).mean(dim=0)
+        graspable = functional.max_pool2d(logits.sigmoid() * self.visible, _CELLS)
+        graspable = functional.pad(graspable, (0, 0, 0, _ROWS - _JUDGED_ROWS))
+        inner = floor[:, :, self._margin : -self._margin, self._margin : -self._margin]
+        colours = functional.avg_pool2d(inner, _CELLS) / 2 + 0.5
+        return (torch.cat([graspable[:, None], colours], dim=1) * 255).round().to(torch.uint8)
+
+
+def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
+    """What turns pictures into the observations of `config.navigation_encoder`."""
+    return FloorObserver(config) if config.navigation_encoder == "floor" else PictureObserver()
+
+
+class Encoder(nn.Module):
+    """Convolutions over a navigation observation.
+
+    Args:
+        kind: as in `ReLMMConfig.navigation_encoder`.
+
+    Attributes:
+        features: length of the output.
+    """
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
+        self.layers = nn.Sequential(*_LAYERS[kind](), nn.Flatten())
+        with torch.no_grad():
+            self.features: int = self.layers(torch.zeros(1, *shape)).shape[1]
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Observations, uint8 (batch, channels, height, width) -> (batch, features)."""
+        scaled = observations.float() / 127.5 - 1
+        encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))
+        return encoded
+
+
+def _paper_layers() -> list[nn.Module]:
+    """Three convolutions of stride 1 with average pooling after each, as in the authors' code (the paper: between)."""
+    return [
+        layer for inputs in (3, 64, 64) for layer in (nn.Conv2d(inputs, 64, 3, padding=1), nn.ReLU(), nn.AvgPool2d(2))
+    ]
+
+
+def _paper_small_layers() -> list[nn.Module]:
+    """The same with 32 channels and stride 2 in place of pooling: a hundredth of the arithmetic."""
+    return [layer for inputs in (3, 32, 32) for layer in (nn.Conv2d(inputs, 32, 3, stride=2, padding=1), nn.ReLU())]
+
+
+def _floor_layers() -> list[nn.Module]:
+    widths = (4, 32, 64, 64)
+    return [
+        layer
+        for inputs, outputs in pairwise(widths)
+        for layer in (nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU())
+    ]
+
+
+_LAYERS: dict[str, Any] = {"paper": _paper_layers, "paper_small": _paper_small_layers, "floor": _floor_layers}

@@ -1,0 +1,186 @@
+"""The hierarchical policy of ReLMM: a gate, then a grasp or a navigation step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from relmm.features import ACTION_NAMES, IMAGE_KEY, MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict, xy_to_cell
+from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.relmm.encoders import make_observer
+from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
+from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch
+
+_SKILL = ACTION_NAMES.index("skill.pos")
+_PLACE = slice(ACTION_NAMES.index("skill_x.pos"), ACTION_NAMES.index("skill_y.pos") + 1)
+
+
+class ReLMMPolicy(ControllerPolicy):
+    """Drives with `navigation`; grasps with `grasping` where that expects success.
+
+    Attributes:
+        grasping: the ensemble.
+        navigation: soft actor-critic.
+        sampling: whether it acts as while training; `config.sample` at first.
+        estimate: the ensemble's opinion of the last picture; None before the first.
+    """
+
+    config_class = ReLMMConfig
+    name = "relmm"
+    config: ReLMMConfig
+
+    def __init__(self, config: ReLMMConfig, **kwargs: Any) -> None:
+        super().__init__(config, **kwargs)
+        with torch.random.fork_rng():  # the same seed gives the same weights, whatever was drawn before
+            torch.manual_seed(config.seed or 0)
+            self.grasping = GraspEnsemble(config)
+            self.navigation = Navigation(config)
+        self.observer = make_observer(config)
+        self.rng = torch.Generator().manual_seed(config.seed or 0)
+        self.sampling = config.sample
+        self.estimate: Estimate | None = None
+
+    # --- Acting -------------------------------------------------------------------------------------------
+    def decide(self, image: NDArray[Any], row: Row) -> dict[str, float]:
+        """See `ControllerPolicy.decide`: greedily, or as while training if `sampling`."""
+        pictures = self.to_pictures(image)
+        estimate = self.look(pictures)
+        if row.attempts < self.config.num_grasp and self._wants_to_grasp(estimate, row):
+            return self.grasp(estimate)
+        return self.navigate(pictures)
+
+    def look(self, pictures: Tensor) -> Estimate:
+        """The ensemble's opinion of pictures 0..1 (batch, 3, 100, 100), which is also remembered."""
+        self.estimate = self.grasping.estimate(pictures)
+        return self.estimate
+
+    @property
+    def grasp_probability(self) -> float:
+        """P[grasp] of the last picture, -1 before the first."""
+        return -1.0 if self.estimate is None else float(self.grasping.grasp_probability(self.estimate)[0])
+
+    def grasp(self, estimate: Estimate) -> dict[str, float]:
+        """The best cell of the ensemble's mean, or a sampled one (paper eq. 2) if `sampling`."""
+        cells = self.grasping.sample(estimate, self.rng) if self.sampling else estimate.mean.argmax(dim=1)
+        return grasp_cell(int(cells[0]))
+
+    def navigate(self, pictures: Tensor) -> dict[str, float]:
+        """A navigation step for one picture: the mean action, or a sampled one if `sampling`."""
+        observations = self.observer(pictures, self.grasping)
+        action = self.navigation.act(observations, self.rng if self.sampling else None)[0]
+        return to_navigation_step(action.tolist())
+
+    def to_pictures(self, image: NDArray[Any]) -> Tensor:
+        """One picture, uint8 (100, 100, 3), as the networks take it: 0..1, (1, 3, 100, 100)."""
+        return torch.from_numpy(image).to(self.weights_device).permute(2, 0, 1)[None] / 255
+
+    @property
+    def weights_device(self) -> torch.device:
+        """Where the weights are."""
+        return self.navigation.log_temperature.device
+
+    def _wants_to_grasp(self, estimate: Estimate, row: Row) -> bool:
+        if not self.sampling:
+            return float(estimate.mean.amax()) >= self.config.grasp_threshold
+        # Once decided, up to N_grasp attempts follow (paper Algorithm 1).
+        return row.attempts > 0 or float(torch.rand(1, generator=self.rng)) <= self.grasp_probability
+
+    # --- Learning -----------------------------------------------------------------------------------------
+    def forward(self, batch: dict[str, Any], **kwargs: Any) -> tuple[Tensor, dict[str, Any] | None]:
+        """The losses of the frames of a LeRobot batch: attempts teach the ensemble, navigation steps the navigation.
+
+        Args:
+            batch: pictures (batch, time, 3, 100, 100) 0..1, `action` (batch, time, 5) and `next.reward` (batch, time),
+                where time is `config.observation_delta_indices`; the rest is not used.
+            **kwargs: LeRobot's, not used.
+        """
+        skills = batch["action"][:, 0, _SKILL].round().long()
+        attempts, steps = skills == Skill.GRASP, _drives(batch, skills)
+        losses, logs = [self._no_loss()], {}
+        if attempts.any():
+            grasp_loss = self.grasping.loss(*_attempts(batch, attempts))
+            losses.append(grasp_loss)
+            logs["grasp_loss"] = grasp_loss.item()
+        if steps.any():
+            navigation_batch = self._navigation_batch(batch, steps)
+            noise = torch.randn(2, int(steps.sum()), ACTIONS, device=batch["action"].device)
+            navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise)
+            losses.append(navigation_loss)
+            logs |= navigation_logs
+        return torch.stack(losses).sum(), logs
+
+    def update(self) -> None:
+        """Called after each step of the optimiser."""
+        self.navigation.update_targets()
+
+    def get_optim_params(self) -> Any:
+        """One group for the ensemble and one for the navigation, with their learning rates."""
+        navigation = [weight for weight in self.navigation.parameters() if weight.requires_grad]
+        return [
+            {"params": list(self.grasping.parameters()), "lr": self.config.grasp_learning_rate},
+            {"params": navigation, "lr": self.config.navigation_learning_rate},
+        ]
+
+    def relabel(self, batch: NavigationBatch, probabilities: Tensor, relabelled: Tensor) -> NavigationBatch:
+        """Reward steps without success with what the current ensemble makes of where they led (paper 4.2).
+
+        Args:
+            batch: with rewards of -1 and 0.
+            probabilities: P[grasp] at the next observations, (batch,).
+            relabelled: which steps, (batch,) bool.
+        """
+        if not self.config.relabel:
+            return batch
+        chance = torch.where(relabelled, probabilities, 0.0)
+        continues = batch.continues * (1 - chance) if self.config.relabel_terminal else batch.continues
+        return NavigationBatch(
+            batch.observations, batch.actions, batch.rewards + chance, batch.next_observations, continues
+        )
+
+    def _navigation_batch(self, batch: dict[str, Any], steps: Tensor) -> NavigationBatch:
+        pictures, actions = batch[IMAGE_KEY][steps], batch["action"][steps]
+        attempted = actions[:, 1:, _SKILL].round() == Skill.GRASP
+        # Only attempts that follow the step without another step between them are its outcome.
+        own = attempted.long().cumprod(dim=1).bool()
+        success = (own & (batch["next.reward"][steps][:, 1:] > 0.5)).any(dim=1)
+        after = (own.sum(dim=1) + 1).clamp(max=pictures.shape[1] - 1)
+        following = pictures[torch.arange(len(pictures)), after]
+        result = NavigationBatch(
+            self.observer(pictures[:, 0], self.grasping),
+            from_navigation_steps(actions[:, 0]),
+            success.float() - 1,
+            self.observer(following, self.grasping),
+            1 - success.float(),
+        )
+        probabilities = self.grasping.grasp_probability(self.grasping.estimate(following))
+        return self.relabel(result, probabilities, ~success)
+
+    def _no_loss(self) -> Tensor:
+        return self.navigation.log_temperature * 0.0
+
+
+def to_navigation_step(action: list[float]) -> dict[str, float]:
+    """A navigation step for forward and turn in -1..1; -1 forward stands still, as in the authors' code."""
+    return action_dict(x_vel=(action[0] + 1) / 2 * MAX_X_VEL, theta_vel=action[1] * MAX_THETA_VEL)
+
+
+def from_navigation_steps(actions: Tensor) -> Tensor:
+    """Forward and turn in -1..1, (batch, 2), of actions as datasets hold them, (batch, 5)."""
+    return torch.stack([actions[:, 0] / MAX_X_VEL * 2 - 1, actions[:, 1] / MAX_THETA_VEL], dim=1).clamp(-1, 1)
+
+
+def _drives(batch: dict[str, Any], skills: Tensor) -> Tensor:
+    """Which frames are navigation steps whose next picture is in the batch, (batch,) bool."""
+    padded = batch.get(f"{IMAGE_KEY}_is_pad")
+    drives = skills == Skill.NAVIGATE
+    return drives if padded is None else drives & ~padded[:, 1]
+
+
+def _attempts(batch: dict[str, Any], attempts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    places = batch["action"][attempts][:, 0, _PLACE].tolist()
+    cells = torch.tensor([xy_to_cell(x, y) for x, y in places], device=attempts.device)
+    return batch[IMAGE_KEY][attempts][:, 0], cells, (batch["next.reward"][attempts][:, 0] > 0.5).float()

@@ -1,0 +1,191 @@
+"""The navigation policy (paper 4.2): soft actor-critic (Haarnoja et al. 2018) on pictures or maps of the floor."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.relmm.encoders import Encoder
+
+ACTIONS = 2  # forward and turn, each -1..1
+_LOG_STD_RANGE = (-5.0, 2.0)
+
+
+@dataclass
+class NavigationBatch:
+    """Navigation steps to learn from.
+
+    Attributes:
+        observations, next_observations: uint8, (batch, channels, height, width).
+        actions: -1..1, (batch, 2).
+        rewards: -1..0, (batch,).
+        continues: 1 where the search goes on, 0 after a success, or the probability of that, (batch,).
+    """
+
+    observations: Tensor
+    actions: Tensor
+    rewards: Tensor
+    next_observations: Tensor
+    continues: Tensor
+
+    def mirrored(self) -> NavigationBatch:
+        """The same with left and right exchanged; for maps of the floor, whose columns are symmetric."""
+        flipped = self.actions * torch.tensor([1.0, -1.0], device=self.actions.device)
+        return NavigationBatch(
+            self.observations.flip(-1), flipped, self.rewards, self.next_observations.flip(-1), self.continues
+        )
+
+
+class Actor(nn.Module):
+    """A tanh-Gaussian over actions.
+
+    Args:
+        config: of the policy.
+        features: length of what the encoder gives.
+    """
+
+    def __init__(self, config: ReLMMConfig, features: int) -> None:
+        super().__init__()
+        self.net = _dense_layers(config, features, 2 * ACTIONS)
+        self._clamped = config.navigation_encoder == "floor"
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and logarithm of the standard deviation before the tanh, (batch, 2) each."""
+        mean, log_std = self.net(features).chunk(2, dim=-1)
+        return mean, log_std.clamp(*_LOG_STD_RANGE) if self._clamped else log_std  # unclamped in the authors' code
+
+    def sample(self, features: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions -1..1, (batch, 2), and their log-densities, (batch,), for standard normal noise, (batch, 2)."""
+        mean, log_std = self(features)
+        raw = mean + log_std.exp() * noise
+        log_density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        # log(1 - tanh(x)^2), in a form that does not overflow.
+        correction = 2 * (math.log(2) - raw - functional.softplus(-2 * raw))
+        return raw.tanh(), (log_density - correction).sum(dim=-1)
+
+
+class Critics(nn.Module):
+    """Two Q-functions, over one encoder or over one each.
+
+    Args:
+        config: of the policy.
+
+    Attributes:
+        features: length of what an encoder gives.
+    """
+
+    def __init__(self, config: ReLMMConfig) -> None:
+        super().__init__()
+        shared = config.navigation_encoder == "floor"
+        self.encoders = nn.ModuleList([Encoder(config.navigation_encoder) for _ in range(1 if shared else 2)])
+        first = self.encoders[0]
+        assert isinstance(first, Encoder)
+        self.features = first.features
+        self.heads = nn.ModuleList([_dense_layers(config, self.features + ACTIONS, 1) for _ in range(2)])
+
+    def encode(self, observations: Tensor) -> list[Tensor]:
+        """Features for each head, two of (batch, features)."""
+        encoded = [encoder(observations) for encoder in self.encoders]
+        return encoded * 2 if len(encoded) == 1 else encoded
+
+    def forward(self, features: list[Tensor], actions: Tensor) -> Tensor:
+        """Values of actions, (2, batch)."""
+        pairs = zip(self.heads, features, strict=True)
+        return torch.stack([head(torch.cat([each, actions], dim=-1)).squeeze(-1) for head, each in pairs])
+
+
+class Navigation(nn.Module):
+    """Soft actor-critic with a tuned temperature, and one loss for all its parts.
+
+    Args:
+        config: of the policy.
+    """
+
+    def __init__(self, config: ReLMMConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.critics = Critics(config)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        # The actor shares the critics' encoder, which only the critics train; in the paper it has its own.
+        shared = config.navigation_encoder == "floor"
+        self.actor_encoder = None if shared else Encoder(config.navigation_encoder)
+        self.actor = Actor(config, self.critics.features)
+        self.log_temperature = nn.Parameter(torch.tensor(math.log(config.initial_temperature)))
+
+    def act(self, observations: Tensor, rng: torch.Generator | None) -> Tensor:
+        """Actions -1..1, (batch, 2): sampled, or the mean action without random numbers."""
+        with torch.no_grad():
+            features = self._actor_features(observations, None)
+            if rng is None:
+                mean: Tensor = self.actor(features)[0].tanh()
+                return mean
+            noise = torch.randn(len(observations), ACTIONS, generator=rng).to(features.device)
+            return self.actor.sample(features, noise)[0]
+
+    def loss(self, batch: NavigationBatch, noise: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """The sum of the critics', the actor's and the temperature's loss; none has gradients in another's weights.
+
+        Args:
+            batch: navigation steps.
+            noise: standard normal, (2, batch, 2): for the actions at this and at the next observation.
+
+        Returns:
+            The loss and its parts, for logs.
+        """
+        temperature = self.log_temperature.exp().detach()
+        targets = self.bellman_targets(batch, noise[1], temperature)
+        features = self.critics.encode(batch.observations)
+        values = self.critics(features, batch.actions)
+        critic_loss = functional.mse_loss(values, targets.expand_as(values))
+
+        actions, log_density = self.actor.sample(self._actor_features(batch.observations, features), noise[0])
+        # Through the critics to the actions, but not into the critics.
+        self.critics.requires_grad_(False)
+        reached = self.critics([each.detach() for each in features], actions).amin(dim=0)
+        self.critics.requires_grad_(True)
+        actor_loss = (temperature * log_density - reached).mean()
+
+        entropy_gap = (log_density.detach() + self.config.target_entropy).mean()
+        temperature_loss = -self.log_temperature.exp() * entropy_gap
+        logs = {
+            "critic_loss": critic_loss.item(),
+            "actor_loss": actor_loss.item(),
+            "temperature": temperature.item(),
+            "entropy": -log_density.detach().mean().item(),
+            "value": values.detach().mean().item(),
+        }
+        return critic_loss + actor_loss + temperature_loss, logs
+
+    @torch.no_grad()
+    def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:
+        """R + gamma * (1 - terminal) * (min Q'(o', a') - temperature * log pi(a'|o')), (batch,)."""
+        actions, log_density = self.actor.sample(self._actor_features(batch.next_observations, None), noise)
+        values = self.targets(self.targets.encode(batch.next_observations), actions).amin(dim=0)
+        targets = batch.rewards + self.config.gamma * batch.continues * (values - temperature * log_density)
+        return targets.clamp(-1 / (1 - self.config.gamma), 0.0) if self.config.clip_targets else targets
+
+    @torch.no_grad()
+    def update_targets(self) -> None:
+        """Move the target networks by `tau` towards the critics."""
+        for target, weight in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
+            target.lerp_(weight, self.config.tau)
+
+    def _actor_features(self, observations: Tensor, shared: list[Tensor] | None) -> Tensor:
+        if self.actor_encoder is not None:
+            features: Tensor = self.actor_encoder(observations)
+            return features
+        return (self.critics.encode(observations) if shared is None else shared)[0].detach()
+
+
+def _dense_layers(config: ReLMMConfig, inputs: int, outputs: int) -> nn.Sequential:
+    """Two hidden layers; the fast preset normalises the first, which keeps small batches stable."""
+    hidden = config.navigation_hidden
+    normalise = [nn.LayerNorm(hidden)] if config.navigation_encoder == "floor" else []
+    first = [nn.Linear(inputs, hidden), *normalise, nn.ReLU()]
+    return nn.Sequential(*first, nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
