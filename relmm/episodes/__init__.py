@@ -1,21 +1,28 @@
-"""Durable LeRobot datasets: recording, resuming, repairing and counting them."""
+"""Durable LeRobot datasets: recording, resuming, repairing, counting, reading and following them."""
 
+from relmm.episodes.follow import Episode, EpisodeFollower, read_episodes
 from relmm.episodes.frames import FrameBuilder
+from relmm.episodes.hub import local_root
 from relmm.episodes.recorder import EpisodeRecorder
 from relmm.episodes.repair import RepairReport, verify_and_repair
-from relmm.episodes.settings import check_new, check_repo_id, check_resume
+from relmm.episodes.settings import check_new, check_repo_id, check_resume, check_trainable
 from relmm.episodes.summary import DatasetSummary, summarize
 from relmm.episodes.writer import DurableDataset
 
 __all__ = [
     "DatasetSummary",
     "DurableDataset",
+    "Episode",
+    "EpisodeFollower",
     "EpisodeRecorder",
     "FrameBuilder",
     "RepairReport",
     "check_new",
     "check_repo_id",
     "check_resume",
+    "check_trainable",
+    "local_root",
+    "read_episodes",
     "summarize",
     "verify_and_repair",
 ]

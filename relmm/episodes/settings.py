@@ -10,10 +10,23 @@ from huggingface_hub.utils import validate_repo_id
 
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
 from relmm.errors import ConfigError, DatasetError
-from relmm.features import DEPTH_KEY, FPS, dataset_features
+from relmm.features import DEPTH_KEY, FPS, IMAGE_KEY, STATE_KEY, dataset_features
 
 # The columns that LeRobot adds by itself.
 LEROBOT_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+# The columns that learning reads.
+TRAINING_COLUMNS = (
+    IMAGE_KEY,
+    STATE_KEY,
+    "action",
+    "next.reward",
+    "next.done",
+    "next.truncated",
+    "complementary_info.phase",
+    "complementary_info.grasp_probability",
+    "complementary_info.robot_time",
+)
+FORMAT_VERSION = "v3.0"  # LeRobot's, also the tag of datasets on the Hub
 
 
 def features_to_store(depth: bool) -> dict[str, dict[str, Any]]:
@@ -90,6 +103,34 @@ def check_resume(
             "record into a new folder, or use the settings of this one."
         )
     return has_depth
+
+
+def check_trainable(root: Path | str) -> None:
+    """Refuse a dataset that relmm cannot learn from; reads `info.json` only, so it may have any number of episodes.
+
+    More columns than `TRAINING_COLUMNS` are welcome.
+
+    Raises:
+        DatasetError: no LeRobot dataset, or of another format, frame rate or columns: each difference is spelled out.
+    """
+    info = DatasetFolder(root).read_json(INFO) or {}
+    if not {"features", "fps", "codebase_version"} <= info.keys() or not isinstance(info["features"], dict):
+        raise DatasetError(
+            f"{root} is no LeRobot dataset, it has no readable {INFO}; choose the folder of a dataset, "
+            "or the name of one on the Hub."
+        )
+    have, want = info["features"], dataset_features()
+    differences = []
+    if info["codebase_version"].split(".")[0] != FORMAT_VERSION.split(".")[0]:
+        differences += _differences("format", info["codebase_version"], FORMAT_VERSION)
+    differences += _differences("fps", info["fps"], FPS)
+    for key in TRAINING_COLUMNS:
+        differences += _differences(f"column {key}", _describe(have.get(key)), _describe(want[key]))
+    if differences:
+        raise DatasetError(
+            f"{root} cannot be trained on: {'; '.join(differences)}; choose a dataset that relmm has recorded, "
+            "or record one with relmm-record."
+        )
 
 
 def add_run(folder: DatasetFolder, depth: bool, robot_type: str | None, episode: int, info: dict[str, Any]) -> None:

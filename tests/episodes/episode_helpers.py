@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from relmm.episodes import DurableDataset, FrameBuilder
+from relmm.episodes import DurableDataset, Episode, FrameBuilder
 from relmm.features import DEPTH_KEY, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phase, Skill, action_dict
 
 REPO_ID = "tester/clean_room"
@@ -39,13 +39,13 @@ def action(episode: int, step: int) -> dict:
 def outcome(episode: int, step: int, length: int) -> dict:
     end = step == length - 1
     return {
-        "next.reward": float(step % 6 == 1),
+        "next.reward": float(step % 6 == 1) * (1 + episode),
         "next.done": end and episode % 2 == 0,
         "next.truncated": end and episode % 2 == 1,
         "next.success": end and episode % 2 == 0,
         "complementary_info.phase": int(Phase(step % 4)),
-        "complementary_info.grasp_probability": -1.0,
-        "complementary_info.robot_time": 0.5 * step,
+        "complementary_info.grasp_probability": episode % 16 / 16 + step / 1024,
+        "complementary_info.robot_time": 100 * episode + 0.5 * step,
     }
 
 
@@ -82,6 +82,28 @@ def check_frame(item: dict, episode: int, step: int, index: int, depth: bool = F
     np.testing.assert_allclose(np.asarray(item["action"]), list(action(episode, step).values()), rtol=1e-6)
     for key, value in outcome(episode, step, length_of(episode)).items():
         assert float(item[key]) == float(value)
+
+
+def check_episode(episode: Episode, number: int, source: int | None = None) -> None:
+    """The episode has this number, and exactly the frames that were recorded as `source` (the same if None)."""
+    source = number if source is None else source
+    steps, length = range(length_of(source)), length_of(source)
+    outcomes = [outcome(source, step, length) for step in steps]
+    assert (episode.index, len(episode)) == (number, length)
+    state = [[source + step / 1000 + i for i in range(len(STATE_NAMES))] for step in steps]
+    for values, expected, dtype in (
+        (episode.images, [picture(source, step) for step in steps], np.uint8),
+        (episode.states, state, np.float32),
+        (episode.actions, [list(action(source, step).values()) for step in steps], np.float32),
+        (episode.rewards, [row["next.reward"] for row in outcomes], np.float32),
+        (episode.dones, [row["next.done"] for row in outcomes], np.bool_),
+        (episode.truncated, [row["next.truncated"] for row in outcomes], np.bool_),
+        (episode.phases, [row["complementary_info.phase"] for row in outcomes], np.int64),
+        (episode.grasp_probabilities, [row["complementary_info.grasp_probability"] for row in outcomes], np.float32),
+        (episode.robot_times, [row["complementary_info.robot_time"] for row in outcomes], np.float32),
+    ):
+        assert values.dtype == dtype
+        np.testing.assert_array_equal(values, np.asarray(expected, dtype))
 
 
 def load(root):

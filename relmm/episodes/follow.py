@@ -1,0 +1,233 @@
+"""Whole episodes of a dataset as arrays, also while another process is still recording it.
+
+The writer publishes the data of an episode before the row of meta/episodes that lists it, each by a rename. So what is
+listed is there and stays as it is, and every file has to be read only once. Needs no LeRobot.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+from numpy.typing import DTypeLike, NDArray
+
+from relmm.episodes.folder import EPISODE_FILES, INFO, DatasetFolder
+from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
+from relmm.episodes.survey import PLACE_COLUMNS, read_columns
+from relmm.errors import DatasetError
+from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One whole episode of n frames.
+
+    Attributes:
+        index: its number in the dataset.
+        images: (n, 100, 100, 3) uint8, RGB.
+        states: (n, len(STATE_NAMES)) float32, units as in `relmm.features`.
+        actions: (n, 5) float32, what was done, by `relmm.features.ACTION_NAMES`.
+        rewards: (n,) float32, 1 where the frame's grasp picked something up.
+        dones: (n,) bool, ended with a success.
+        truncated: (n,) bool, ended at the step limit.
+        phases: (n,) int64, a `relmm.features.Phase` each.
+        grasp_probabilities: (n,) float32, P[grasp], -1 where it was not asked.
+        robot_times: (n,) float32, s on the robot's clock.
+    """
+
+    index: int
+    images: NDArray[np.uint8]
+    states: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    dones: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    phases: NDArray[np.int64]
+    grasp_probabilities: NDArray[np.float32]
+    robot_times: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+def read_episodes(root: Path | str, first: int = 0) -> Iterator[Episode]:
+    """All episodes that are saved by now, in order, one at a time in memory.
+
+    Args:
+        root: a dataset; it may be being recorded.
+        first: number of the first episode to read.
+
+    Returns:
+        An iterator, which raises DatasetError where a listed episode is damaged.
+
+    Raises:
+        DatasetError: no dataset, or none that relmm can train on; at once, not at the first episode.
+    """
+    check_trainable(root)
+    return _read_all(EpisodeFollower(root, first))
+
+
+def _read_all(follower: EpisodeFollower) -> Iterator[Episode]:
+    reached = -1
+    # Again after a problem: a file may have appeared between listing and reading. In vain twice is damage.
+    while follower.next > reached:
+        reached = follower.next
+        yield from follower.read_new()
+        if not follower.problem:
+            return
+    raise DatasetError(f"{follower.problem}; resume its recording, which repairs it, or restore it from a copy.")
+
+
+class EpisodeFollower:
+    """Reads episodes as they are saved: each once, whole, and in order.
+
+    Attributes:
+        next: number of the next episode.
+        problem: why the last reading stopped at an episode that is listed, in words; empty when it did not. It passes
+            where files were just being replaced, or LeRobot's own recorder has not finished them; else it is damage.
+    """
+
+    def __init__(self, root: Path | str, first: int = 0) -> None:
+        """Reads nothing yet.
+
+        Args:
+            root: the dataset; it need not exist yet.
+            first: number of the first episode to read.
+        """
+        self.next = first
+        self.problem = ""
+        self._folder = DatasetFolder(root)
+        self._data_path: str | None = None
+        self._last_episodes: dict[str, int] = {}  # number of the last one, by file of meta/episodes
+
+    def poll(self) -> list[Episode]:
+        """The episodes that were saved since the last call; none while there is no dataset.
+
+        Raises:
+            DatasetError: the dataset is none that relmm can train on.
+        """
+        return list(self.read_new())
+
+    def read_new(self) -> Iterator[Episode]:
+        """As `poll`, with one episode at a time in memory."""
+        self.problem = ""
+        if self._data_path is None:
+            self._data_path = self._find_data_path()
+        if self._data_path is None:
+            return
+        data = _DataFiles(self._folder, self._data_path)
+        for row in self._new_rows():
+            episode = data.read(row) if row["episode_index"] == self.next else None
+            if episode is None:
+                self.problem = f"episode {self.next} of {self._folder.root} is missing or cut off"
+                return
+            self.next += 1
+            yield episode
+
+    def _find_data_path(self) -> str | None:
+        info = self._folder.read_json(INFO)
+        if info is None:
+            return None
+        check_trainable(self._folder.root)
+        return str(info["data_path"])
+
+    def _new_rows(self) -> Iterator[dict[str, Any]]:
+        """Rows of meta/episodes from episode `next` on; reads each file when it is needed."""
+        names = self._folder.files(EPISODE_FILES)
+        for name in names[bisect_left(names, self.next, key=self._last_episode) :]:
+            rows = self._rows(name)
+            if rows is None:
+                self.problem = f"{self._folder.root / name} is missing or cut off"
+                return
+            yield from (row for row in rows if row["episode_index"] >= self.next)
+
+    def _last_episode(self, name: str) -> int:
+        """Of a file of meta/episodes; for one that cannot be read, a number that does not let it be skipped."""
+        if name not in self._last_episodes:
+            self._rows(name)
+        return self._last_episodes.get(name, self.next)
+
+    def _rows(self, name: str) -> list[dict[str, Any]] | None:
+        table = read_columns(self._folder.root / name, PLACE_COLUMNS)
+        if table is None:
+            return None
+        rows: list[dict[str, Any]] = table.to_pylist()
+        if rows:
+            self._last_episodes[name] = rows[-1]["episode_index"]
+        return rows
+
+
+class _DataFiles:
+    """Reads episodes from the data files; LeRobot puts several into one file when it edits a dataset."""
+
+    def __init__(self, folder: DatasetFolder, data_path: str) -> None:
+        self._folder = folder
+        self._data_path = data_path
+        self._name = ""
+        self._table: pa.Table | None = None  # the file of the last episode, its pictures still compressed
+
+    def read(self, row: dict[str, Any]) -> Episode | None:
+        """The episode of a row of meta/episodes; None when its file does not hold it whole."""
+        name = self._data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+        if name != self._name:
+            self._name = name
+            self._table = read_columns(self._folder.root / name, ["episode_index", "index", *TRAINING_COLUMNS])
+        if self._table is None:
+            return None
+        expected = np.arange(row["dataset_from_index"], row["dataset_to_index"])
+        begin = int(np.searchsorted(self._table["index"].to_numpy(), row["dataset_from_index"]))
+        frames = self._table.slice(begin, len(expected))
+        whole = (
+            len(expected) == row["length"] > 0
+            and np.array_equal(frames["index"].to_numpy(), expected)
+            and np.all(frames["episode_index"].to_numpy() == row["episode_index"])
+        )
+        return self._episode(row["episode_index"], frames) if whole else None
+
+    def _episode(self, index: int, frames: pa.Table) -> Episode:
+        try:
+            images = _decode(frames[IMAGE_KEY])
+        except (ValueError, cv2.error) as error:
+            where = self._folder.root / self._name
+            raise DatasetError(f"a picture of episode {index} in {where} cannot be read: {error}.") from error
+        return Episode(
+            index=index,
+            images=images,
+            states=_numbers(frames[STATE_KEY], np.float32).reshape(-1, len(STATE_NAMES)),
+            actions=_numbers(frames["action"], np.float32).reshape(-1, len(ACTION_NAMES)),
+            rewards=_numbers(frames["next.reward"], np.float32),
+            dones=_numbers(frames["next.done"], np.bool_),
+            truncated=_numbers(frames["next.truncated"], np.bool_),
+            phases=_numbers(frames["complementary_info.phase"], np.int64),
+            grasp_probabilities=_numbers(frames["complementary_info.grasp_probability"], np.float32),
+            robot_times=_numbers(frames["complementary_info.robot_time"], np.float32),
+        )
+
+
+def _numbers(column: pa.ChunkedArray, dtype: DTypeLike) -> NDArray[Any]:
+    """A copy, so that it does not keep its whole file in memory; lists are joined."""
+    values = column.combine_chunks()
+    if pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
+        values = values.flatten()
+    return values.to_numpy(zero_copy_only=False).astype(dtype)
+
+
+def _decode(column: pa.ChunkedArray) -> NDArray[np.uint8]:
+    files = column.combine_chunks().field("bytes").to_pylist()
+    images = np.empty((len(files), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+    for image, file in zip(images, files, strict=True):
+        if not file:
+            raise ValueError("it is not in the file, which has only its name")
+        picture = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise ValueError("it is no PNG")
+        if picture.shape != image.shape:
+            raise ValueError(f"it has the shape {picture.shape}, and {image.shape} is needed")
+        image[:] = picture[..., ::-1]  # OpenCV's order is BGR
+    return images

@@ -1,0 +1,380 @@
+"""Reading whole episodes, also of a dataset that is being recorded."""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from episode_children import die_after_renames, record_without_end
+from episode_helpers import INFO, REPO_ID, TASK, arguments, check_episode, length_of, load, new_dataset, record
+
+from relmm.episodes import (
+    DurableDataset,
+    EpisodeFollower,
+    EpisodeRecorder,
+    FrameBuilder,
+    check_trainable,
+    read_episodes,
+    summarize,
+)
+from relmm.errors import DatasetError
+from relmm.features import FPS, IMAGE_KEY, dataset_features
+
+DATA = "data/chunk-000/file-{:03d}.parquet"
+META = "meta/episodes/chunk-000/file-{:03d}.parquet"
+
+
+def check_episodes(episodes, numbers):
+    episodes = list(episodes)
+    assert [episode.index for episode in episodes] == list(numbers)
+    for episode in episodes:
+        check_episode(episode, episode.index)
+
+
+def test_what_was_recorded_comes_back(tmp_path):
+    settings = {"depth": True, "robot_type": "locobot_sim", "info": INFO}
+    with EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, **settings) as recorder:
+        for number in range(6):
+            for step in range(length_of(number)):
+                recorder.add_frame(*arguments(number, step, depth=True), TASK)
+            recorder.save_episode()
+    check_episodes(read_episodes(tmp_path / "d"), range(6))
+    for first in (1, 5, 6, 9):
+        check_episodes(read_episodes(tmp_path / "d", first), range(first, 6))
+    check_episodes(EpisodeFollower(tmp_path / "d", first=4).poll(), [4, 5])
+    new_dataset(tmp_path / "empty", 0)
+    assert list(read_episodes(tmp_path / "empty")) == []
+
+
+def test_reading_is_one_episode_at_a_time(tmp_path):
+    new_dataset(tmp_path / "d", 3)
+    episodes = read_episodes(tmp_path / "d")
+    check_episode(next(episodes), 0)
+    (tmp_path / "d" / DATA.format(2)).unlink()  # not looked at yet
+    check_episode(next(episodes), 1)
+    with pytest.raises(DatasetError, match=r"episode 2 of .* is missing or cut off; .*repairs it"):
+        next(episodes)
+
+
+def test_arrays_are_their_own(tmp_path):
+    """Views of the file that they are from would keep it in memory, and are read-only."""
+    new_dataset(tmp_path / "d", 1)
+    episode = next(read_episodes(tmp_path / "d"))
+    for array in (episode.images, episode.states, episode.rewards, episode.dones, episode.phases):
+        assert array.flags.writeable
+
+
+# --- Following -----------------------------------------------------------------------------------------------
+def test_each_episode_comes_once(tmp_path):
+    follower = EpisodeFollower(tmp_path / "d")
+    assert follower.poll() == []
+    with DurableDataset.create(REPO_ID, tmp_path / "d", False, "locobot_sim", INFO) as dataset:
+        assert follower.poll() == []
+        record(dataset, range(2))
+        check_episodes(follower.poll(), [0, 1])
+        assert follower.poll() == []
+        dataset.add_frame(*built_frame(2, 0))
+        assert follower.poll() == []
+        dataset.discard_episode()
+        record(dataset, range(2, 3))
+        check_episodes(follower.poll(), [2])
+    with DurableDataset.open(tmp_path / "d", REPO_ID) as dataset:
+        record(dataset, range(3, 8))
+    check_episodes(follower.poll(), range(3, 8))
+    assert (follower.poll(), follower.next, follower.problem) == ([], 8, "")
+
+
+def built_frame(episode, step):
+    return FrameBuilder(False).build(*arguments(episode, step)), TASK
+
+
+def test_a_poll_that_finds_nothing_new_opens_no_parquet_file(tmp_path, monkeypatch):
+    new_dataset(tmp_path / "d", 5)
+    follower = EpisodeFollower(tmp_path / "d")
+    assert len(follower.poll()) == 5
+    monkeypatch.setattr(pq, "ParquetFile", None)
+    assert follower.poll() == []
+
+
+def test_chunks_are_read_in_order(tmp_path):
+    new_dataset(tmp_path / "d", 1)
+    info = json.loads((tmp_path / "d/meta/info.json").read_text())
+    (tmp_path / "d/meta/info.json").write_text(json.dumps(info | {"chunks_size": 2}))
+    follower = EpisodeFollower(tmp_path / "d")
+    check_episodes(follower.poll(), [0])
+    with DurableDataset.open(tmp_path / "d", REPO_ID) as dataset:
+        record(dataset, range(1, 7))
+    assert (tmp_path / "d/meta/episodes/chunk-002").exists()
+    check_episodes(follower.poll(), range(1, 7))
+    check_episodes(read_episodes(tmp_path / "d", 4), [4, 5, 6])
+
+
+def test_files_that_appear_one_by_one_and_half_written(tmp_path):
+    """A slow copy of a dataset: worse than any order in which the writer publishes."""
+    whole, root = tmp_path / "whole", tmp_path / "copy"
+    new_dataset(whole, 3)
+    follower = EpisodeFollower(root)
+    seen = []
+
+    def copy(name, until=None):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes((whole / name).read_bytes()[:until])
+        seen.extend(follower.poll())
+        return len(seen)
+
+    assert copy("meta/info.json", 200) == 0
+    assert copy("meta/info.json") == 0
+    assert follower.problem == ""
+    assert copy(DATA.format(0)) == 0
+    assert copy(META.format(1)) == 0  # its data and the episode before are not there
+    assert "episode 0 of" in follower.problem
+    assert copy(META.format(0), 3000) == 0
+    assert "file-000.parquet is missing or cut off" in follower.problem
+    assert copy(META.format(0)) == 1
+    assert "episode 1 of" in follower.problem
+    assert copy(DATA.format(1), 20_000) == 1
+    assert copy(META.format(2)) == 1
+    assert copy(DATA.format(2)) == 1
+    assert copy(DATA.format(1)) == 3
+    assert follower.problem == ""
+    check_episodes(seen, range(3))
+
+
+@pytest.mark.parametrize("done", range(5))  # data, meta/episodes, stats, info
+def test_a_kill_between_the_renames_of_a_save(tmp_path, forkserver, done):
+    root = tmp_path / "d"
+    new_dataset(root, 1)
+    follower = EpisodeFollower(root)
+    seen = follower.poll()
+    process = forkserver.Process(target=die_after_renames, args=(root, 1, done))
+    process.start()
+    process.join(60)
+    assert process.exitcode == -signal.SIGKILL
+    seen += follower.poll()
+    assert len(seen) == (3 if done >= 2 else 2)
+    check_episodes(read_episodes(root), range(len(seen)))
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        assert dataset.episodes == len(seen)  # what was read is never taken back
+        record(dataset, range(dataset.episodes, 5))
+    check_episodes(seen + follower.poll(), range(5))
+
+
+def kill_and_wait(pid):
+    """Of a process that is no child of this one."""
+    descriptor = os.pidfd_open(pid)
+    signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+    assert select.select([descriptor], [], [], 30)[0]
+    os.close(descriptor)
+
+
+def test_following_a_recorder_that_is_killed_and_resumed(tmp_path, forkserver):
+    root, random = tmp_path / "d", np.random.default_rng(4)
+    follower, seen = EpisodeFollower(root), []
+    for resume in (False, True):
+        receiver, sender = forkserver.Pipe(duplex=False)
+        process = forkserver.Process(target=record_without_end, args=(root, resume, sender))
+        process.start()
+        sender.close()
+        writer, enough = receiver.recv(), len(seen) + 8
+        while len(seen) < enough:
+            assert process.is_alive()
+            seen += follower.poll()
+        time.sleep(random.uniform(0.0, 0.05))
+        process.kill()
+        kill_and_wait(writer)
+        process.join()
+    seen += follower.poll()
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        assert dataset.episodes == len(seen)
+        record(dataset, range(dataset.episodes, dataset.episodes + 2))
+    seen += follower.poll()
+    assert len(seen) == summarize(root).episodes
+    check_episodes(seen, range(len(seen)))
+    check_episodes(read_episodes(root), range(len(seen)))
+
+
+def test_an_episode_that_is_recorded_again_after_damage(tmp_path):
+    """Its files get the names of those that a repair has set aside."""
+    root = tmp_path / "d"
+    new_dataset(root, 2)
+    follower = EpisodeFollower(root)
+    follower.poll()
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        record(dataset, range(3, 4))  # as episode 2
+    (root / DATA.format(2)).write_bytes(b"")
+    assert follower.poll() == []
+    assert "episode 2 of" in follower.problem
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        assert dataset.episodes == 2
+        record(dataset, range(2, 4))
+    check_episodes(follower.poll(), [2, 3])
+
+
+# --- Datasets that LeRobot has edited ------------------------------------------------------------------------
+def test_deleted_episodes(tmp_path):
+    from lerobot.datasets.dataset_tools import delete_episodes
+
+    new_dataset(tmp_path / "d", 5)
+    delete_episodes(load(tmp_path / "d"), [1, 3], output_dir=tmp_path / "less", repo_id="tester/less")
+    episodes = list(read_episodes(tmp_path / "less"))
+    assert len(episodes) == 3
+    for number, source in enumerate((0, 2, 4)):
+        check_episode(episodes[number], number, source)
+
+
+def test_several_episodes_in_a_file_and_then_more(tmp_path):
+    from lerobot.datasets.dataset_tools import merge_datasets
+
+    root = tmp_path / "merged"
+    new_dataset(tmp_path / "a", 3)
+    with DurableDataset.create(REPO_ID, tmp_path / "b", False, "locobot_sim") as dataset:
+        record(dataset, range(6, 9))
+    merge_datasets([load(tmp_path / name) for name in "ab"], REPO_ID, output_dir=root)
+    assert len(list(root.glob("data/*/*.parquet"))) == 1
+    sources = [0, 1, 2, 6, 7, 8]
+    follower = EpisodeFollower(root, first=1)
+    for number, episode in enumerate(follower.poll(), start=1):
+        check_episode(episode, number, sources[number])
+    assert follower.next == 6
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        record(dataset, range(6, 8))
+    check_episodes(follower.poll(), [6, 7])
+    for number, episode in enumerate(read_episodes(root)):
+        check_episode(episode, number, [*sources, 6, 7][number])
+
+
+def test_lerobots_own_recording(tmp_path):
+    """Nothing of it can be read until it ends; it has all episodes in one file, from which some are then deleted."""
+    from lerobot.datasets.dataset_tools import delete_episodes
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path / "d"
+    stock = LeRobotDataset.create(
+        REPO_ID, FPS, dataset_features(), root, use_videos=False, video_backend="pyav", metadata_buffer_size=2
+    )
+    follower = EpisodeFollower(root)
+    for number in range(5):
+        for step in range(length_of(number)):
+            frame, task = built_frame(number, step)
+            stock.add_frame({**frame, "task": task})
+        stock.save_episode()
+        assert follower.poll() == []
+    assert "cut off" in follower.problem
+    stock.finalize()
+    check_episodes(follower.poll(), range(5))
+    assert len(list(root.glob("data/*/*.parquet"))) == 1
+    check_episodes(read_episodes(root, 3), [3, 4])
+    delete_episodes(load(root), [1, 3], output_dir=tmp_path / "less", repo_id="tester/less")
+    less = list(read_episodes(tmp_path / "less"))
+    assert len(less) == 3
+    for number, source in enumerate((0, 2, 4)):
+        check_episode(less[number], number, source)
+
+
+# --- What cannot be trained on -------------------------------------------------------------------------------
+def edit_info(root, change):
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda info: info["features"][IMAGE_KEY].update(dtype="video"), "have video .*want image"),
+        (lambda info: info["features"][IMAGE_KEY].update(shape=[64, 64, 3]), r"have image \(64, 64, 3\).*want image"),
+        (lambda info: info["features"].pop(IMAGE_KEY), f"column {IMAGE_KEY}: have no such column"),
+        (lambda info: info["features"].pop("next.reward"), "column next.reward: have no such column, want float32"),
+        (
+            lambda info: info["features"]["action"]["names"].reverse(),
+            r"column action: have .* of skill_y\.pos, skill_x",
+        ),
+        (lambda info: info["features"]["observation.state"]["names"].reverse(), "column observation.state: have"),
+        (lambda info: info.update(fps=30), "fps: have 30, want 2"),
+        (lambda info: info.update(codebase_version="v2.1"), r"format: have v2\.1, want v3\.0"),
+        (lambda info: info.pop("features"), "no LeRobot dataset"),
+    ],
+)
+def test_other_datasets_are_refused_before_anything_is_read(tmp_path, change, words):
+    new_dataset(tmp_path / "d", 1)
+    check_trainable(tmp_path / "d")
+    edit_info(tmp_path / "d", change)
+    for read in (check_trainable, read_episodes, lambda root: EpisodeFollower(root).poll()):
+        with pytest.raises(DatasetError, match=words) as caught:
+            read(tmp_path / "d")
+        assert str(caught.value).startswith(str(tmp_path / "d"))
+        assert "; choose " in str(caught.value)
+
+
+def test_more_columns_are_welcome(tmp_path):
+    new_dataset(tmp_path / "d", 1, depth=True)
+    edit_info(tmp_path / "d", lambda info: info["features"].pop("next.success"))
+    check_episodes(read_episodes(tmp_path / "d"), [0])
+
+
+def test_folders_that_are_no_dataset(tmp_path):
+    for name in ("nothing", "."):
+        with pytest.raises(DatasetError, match=r"no readable meta/info\.json; choose"):
+            read_episodes(tmp_path / name)
+        assert EpisodeFollower(tmp_path / name).poll() == []  # it may come
+
+
+def rewrite(path, change):
+    table = pq.read_table(path, partitioning=None)
+    pq.write_table(change(table), path)
+
+
+def with_column(key, values):
+    return lambda table: table.set_column(table.column_names.index(key), key, values(table[key]))
+
+
+@pytest.mark.parametrize("key", ["index", "episode_index"])
+def test_rows_of_another_episode_are_never_taken(tmp_path, key):
+    new_dataset(tmp_path / "d", 2)
+    rewrite(tmp_path / "d" / DATA.format(1), with_column(key, lambda old: pa.array([0, *old.to_pylist()[1:]])))
+    follower = EpisodeFollower(tmp_path / "d")
+    check_episodes(follower.poll(), [0])
+    assert "episode 1 of" in follower.problem
+    episodes = read_episodes(tmp_path / "d")
+    check_episode(next(episodes), 0)
+    with pytest.raises(DatasetError, match="episode 1 of"):
+        next(episodes)
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        (None, "only its name"),
+        (b"no picture", "no PNG"),
+        (cv2.imencode(".png", np.zeros((50, 60, 3), np.uint8))[1].tobytes(), r"shape \(50, 60, 3\)"),
+    ],
+)
+def test_pictures_that_cannot_be_read(tmp_path, file, words):
+    new_dataset(tmp_path / "d", 1)
+
+    def damaged(old):
+        rows = old.to_pylist()
+        return pa.array([*rows[:-1], rows[-1] | {"bytes": file}], old.type)
+
+    rewrite(tmp_path / "d" / DATA.format(0), with_column(IMAGE_KEY, damaged))
+    with pytest.raises(DatasetError, match=f"a picture of episode 0 in .*file-000.parquet cannot be read: .*{words}"):
+        next(read_episodes(tmp_path / "d"))
+
+
+def test_reading_needs_no_lerobot(tmp_path):
+    new_dataset(tmp_path / "d", 2)
+    code = (
+        "import sys; from relmm.episodes import read_episodes; episodes = list(read_episodes(sys.argv[1])); "
+        "print(len(episodes), sorted({'lerobot', 'torch', 'datasets'} & sys.modules.keys()))"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "d")]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "2 []\n"
