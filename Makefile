@@ -2,6 +2,7 @@
 
 PYTHON ?= python3
 JOBS ?= 2
+DEMO_STEPS ?= 2000
 DEMO_DIR ?= outputs/demo/$(shell date +%Y-%m-%d_%H-%M-%S)
 DEMO_DIR := $(DEMO_DIR)# expanded once: every step of the demo uses the same folder
 
@@ -31,12 +32,15 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python $(PIP_INSTALL) -c constraints.txt -e '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## record a scripted robot in simulation, then evaluate and film it
-	$(BIN)/relmm-record --robot.type=locobot_sim --robot.room=no_obstacles --policy.type=relmm_scripted \
-	  --dataset.repo_id=demo/no_obstacles --dataset.root=$(DEMO_DIR)/dataset --dataset.num_episodes=10 --seed=0
-	$(BIN)/relmm-eval --policy.type=relmm_scripted --env.room=no_obstacles \
-	  --eval.n_episodes=3 --seed=0 --output_dir=$(DEMO_DIR)/eval
-	@echo "the demo is in $(DEMO_DIR)"
+demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (12 minutes)
+	$(BIN)/relmm-train --robot.type=locobot_sim --robot.room=no_obstacles --dataset.repo_id=demo/no_obstacles \
+	  --steps=$(DEMO_STEPS) --seed=0 --output_dir=$(DEMO_DIR)/train
+	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/000000/pretrained_model --env.room=no_obstacles \
+	  --eval.n_episodes=1 --seed=0 --output_dir=$(DEMO_DIR)/before
+	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/last/pretrained_model --env.room=no_obstacles \
+	  --eval.n_episodes=3 --seed=0 --output_dir=$(DEMO_DIR)/after
+	@$(BIN)/python -m relmm.commands.demo $(DEMO_DIR)/before $(DEMO_DIR)/after $(DEMO_DIR)/before_and_after.mp4
+	@echo "learning curve: $(DEMO_DIR)/train/learning_curve.png"
 
 test: $(STAMP) ## run the tests, but not the slow ones
 	$(PYTEST) -n $(JOBS) --dist loadfile

@@ -19,6 +19,7 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
     Raises:
         ConfigError: neither was given, or there is no policy at the path.
     """
+    _check_device(parser.parse_arg("policy.device"))
     path = parser.get_path_arg("policy")
     if path:
         overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
@@ -33,6 +34,42 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
     if policy is None:
         raise ConfigError("No policy was given: say --policy.type=relmm_scripted, or --policy.path=FOLDER_OR_REPO.")
     return policy
+
+
+class FreshWeights:
+    """Lets an actor take over the weights of newer checkpoints, while another process trains.
+
+    Args:
+        actor: loaded from `path`.
+        path: its folder; when it leads through a link such as `checkpoints/last`, that may come to point elsewhere.
+    """
+
+    def __init__(self, actor: Actor, path: Path | None) -> None:
+        self._actor, self._path = actor, path
+        self._loaded = None if path is None else path.resolve()
+
+    def take(self) -> Path | None:
+        """Load what is newer than the last time; the folder it is in, None if there is nothing."""
+        newest = None if self._path is None else self._path.resolve()
+        if newest is None or newest == self._loaded or not (newest / "model.safetensors").is_file():
+            return None
+        from safetensors.torch import load_model
+
+        load_model(self._actor.policy, newest / "model.safetensors")
+        self._loaded = newest
+        return newest
+
+
+def _check_device(asked: str | None) -> None:
+    """Refuse a device that was asked for and is not there; LeRobot would quietly take another one."""
+    if asked is None:
+        return
+    import torch
+
+    there = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+    there += ["cuda"] * torch.cuda.is_available() + ["mps"] * torch.backends.mps.is_available()
+    if asked not in there:
+        raise ConfigError(f"policy.device is {asked!r}, which this machine does not have: say --policy.device=cpu.")
 
 
 def take_seed(config: Any, seed: int) -> None:

@@ -10,7 +10,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, progress, run
-from relmm.commands.policies import make_actor, policy_from_path, take_seed
+from relmm.commands.policies import FreshWeights, make_actor, policy_from_path, take_seed
 from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, summarize
 from relmm.errors import ConfigError
 from relmm.learning.actor import Actor
@@ -134,9 +134,13 @@ def _collect(
         print(recorder.repaired)
     life = Life(robot, [recorder], robot.seconds, config.max_steps, should_stop=lambda: signals.stopped)
     collector = Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
+    assert config.policy is not None
+    fresh = FreshWeights(actor, config.policy.pretrained_path)
     frames = successes = grasps = 0
     with progress(config.dataset.num_episodes, "episode") as bar:
         while bar.n < config.dataset.num_episodes and not signals.stopped:
+            if (checkpoint := fresh.take()) is not None:
+                bar.write(f"acting by {checkpoint}")
             result = collector.episode()
             frames, grasps, successes = frames + result.frames, grasps + result.grasps, successes + result.success
             bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, refresh=False)

@@ -14,6 +14,7 @@ import numpy as np
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, progress, run
+from relmm.commands.curve import draw_learning_curve
 from relmm.commands.policies import make_actor, take_seed
 from relmm.commands.presets import resolve_config_path
 from relmm.commands.train_config import TrainConfig
@@ -148,7 +149,9 @@ def train(config: TrainConfig) -> None:
             _train_on_stream(Run(config, signals), config.dataset.follow)
         else:
             _train_on_robot(Run(config, signals))
-    print(f"checkpoints, metrics and dataset: {config.output_dir}")
+    assert config.output_dir is not None
+    draw_learning_curve(config.output_dir / "metrics.jsonl", config.output_dir / "learning_curve.png")
+    print(f"checkpoints, metrics, dataset and learning_curve.png: {config.output_dir}")
 
 
 def _train_on_robot(run: Run) -> None:
@@ -263,8 +266,10 @@ def _train_on_stream(run: Run, root: Path) -> None:
 
 
 def main() -> None:
-    """Entry point of `relmm-train`."""
+    """Entry point of `relmm-train`; there is only one policy that learns, so its type need not be said."""
     resolve_config_path(sys.argv)
+    if not any(argument.startswith(("--policy.type", "--policy.path", "--config_path")) for argument in sys.argv):
+        sys.argv.append("--policy.type=relmm")
     run("relmm-train", TrainConfig, train)
 
 

@@ -17,10 +17,21 @@ from relmm.policies.relmm.navigation import ACTIONS, NavigationBatch
 class RecordedEpisode(Protocol):
     """What `relmm.episodes` reads: a row a frame."""
 
-    images: NDArray[np.uint8]
-    actions: NDArray[np.float32]
-    rewards: NDArray[np.float32]
-    phases: NDArray[np.int64]
+    @property
+    def images(self) -> NDArray[np.uint8]:
+        """(n, 100, 100, 3)."""
+
+    @property
+    def actions(self) -> NDArray[np.float32]:
+        """(n, 5)."""
+
+    @property
+    def rewards(self) -> NDArray[np.float32]:
+        """(n,)."""
+
+    @property
+    def phases(self) -> NDArray[np.int64]:
+        """(n,)."""
 
 
 class Learner:

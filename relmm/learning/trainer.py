@@ -103,7 +103,8 @@ class Trainer:
         estimate = self._look()
         self.life.step(grasp_cell(self._choose_cell(estimate)), phase, self.policy.grasp_probability)
         success = self.life.holding
-        self.learner.update_grasping()
+        if phase == Phase.CURRICULUM or not self.config.freeze_grasping:
+            self.learner.update_grasping()
         return success
 
     @property

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -53,6 +54,30 @@ class Scene:
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
+
+
+def beside(first: Path, second: Path, path: Path) -> None:
+    """Put two films of equal height beside each other; the shorter one stands still at its end.
+
+    Args:
+        first: mp4 file, on the left.
+        second: another one, on the right.
+        path: of the new one.
+    """
+    import av
+
+    with av.open(str(first)) as left, av.open(str(second)) as right, av.open(str(path), mode="w") as output:
+        rate = left.streams.video[0].average_rate
+        stream = output.add_stream("libx264", rate=rate, options={"crf": "23"})
+        stream.width = left.streams.video[0].width + right.streams.video[0].width
+        stream.height, stream.pix_fmt = left.streams.video[0].height, "yuv420p"
+        shown: list[Any] = [None, None]
+        for pair in zip_longest(left.decode(video=0), right.decode(video=0)):
+            shown = [
+                old if new is None else new.to_ndarray(format="rgb24") for new, old in zip(pair, shown, strict=True)
+            ]
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(np.hstack(shown), format="rgb24")))
+        output.mux(stream.encode())
 
 
 class Film:

@@ -40,6 +40,7 @@ class ReLMMConfig(ControllerConfig):
         grasp_threshold: mean success above which the greedy policy grasps.
         grasp_learning_rate, grasp_batch_size: of the ensemble's optimiser.
         grasp_updates: per attempt.
+        freeze_grasping: the ensemble learns in the curriculum only.
         num_stationary: attempts of the stationary curriculum.
         min_attempts_to_update: attempts stored before the first update; until then cells are drawn uniformly.
         num_start: failures in a row that end a practice session of the autonomous curriculum without a success.
@@ -84,6 +85,7 @@ class ReLMMConfig(ControllerConfig):
     grasp_learning_rate: float = 1e-3
     grasp_batch_size: int = 64
     grasp_updates: int = 4
+    freeze_grasping: bool = False
     # Curricula (paper 4.4 and App. "Grasping Curriculum").
     num_stationary: int = 200  # N_st
     min_attempts_to_update: int = 8  # N_bt

@@ -1,0 +1,170 @@
+"""relmm-train as a user runs it: tiny runs from the command line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.torch import load_file
+
+from relmm.commands.train import main
+from relmm.episodes import read_episodes, summarize
+from relmm.features import Phase, Skill
+from relmm.learning.progress import read_metrics
+
+TINY = [
+    "--robot.type=locobot_sim",
+    "--policy.device=cpu",
+    "--policy.num_stationary=6",
+    "--policy.min_attempts_to_update=4",
+    "--policy.min_steps_to_update=4",
+    "--policy.navigation_batch_size=8",
+    "--policy.grasp_batch_size=8",
+    "--policy.random_steps=2",
+    "--pseudo_reset_steps=2",
+    "--replay_frames=2000",
+    "--env_eval_freq=0",
+    "--log_freq=2",
+    "--save_freq=4",
+]
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "relmm.commands.train", *arguments]
+
+
+def train(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=110, check=False)
+
+
+def weights(folder: Path) -> dict[str, np.ndarray]:
+    return {key: value.numpy() for key, value in load_file(folder / "pretrained_model" / "model.safetensors").items()}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("train") / "run"
+    result = train(*TINY, "--steps=8", f"--output_dir={folder}")
+    assert result.returncode == 0, result.stderr
+    return folder
+
+
+def test_run_leaves_lerobots_tree(finished):
+    last = finished / "checkpoints" / "last"
+    assert last.is_symlink()
+    assert last.resolve().name == "000008"
+    assert {path.name for path in (finished / "checkpoints").iterdir()} == {"000000", "000004", "000008", "last"}
+    model = {path.name for path in (last / "pretrained_model").iterdir()}
+    assert {"config.json", "model.safetensors", "train_config.json", "policy_preprocessor.json"} <= model
+    state = {path.name for path in (last / "training_state").iterdir()}
+    assert {"grasping", "navigation", "training_step.json", "rng_state.safetensors", "relmm_state.json"} <= state
+
+
+def test_dataset_holds_the_whole_life(finished):
+    episodes = list(read_episodes(finished / "dataset"))
+    actions = np.concatenate([episode.actions for episode in episodes])
+    phases = np.concatenate([episode.phases for episode in episodes])
+    skills = actions[:, 2].round()
+    assert np.count_nonzero((skills == Skill.GRASP) & (phases == Phase.CURRICULUM)) == 6
+    assert np.count_nonzero((skills == Skill.NAVIGATE) & (phases == Phase.LEARNING)) == 8
+
+
+def test_metrics_count_what_the_dataset_holds(finished):
+    last = read_metrics(finished / "metrics.jsonl")[-1]
+    summary = summarize(finished / "dataset")
+    assert last["steps"] == 8
+    assert last["attempts"] == summary.grasps
+    assert last["successes"] == summary.successful_grasps
+
+
+def test_equal_seeds_give_equal_runs(finished, tmp_path):
+    assert train(*TINY, "--steps=8", f"--output_dir={tmp_path / 'again'}").returncode == 0
+    first, second = weights(finished / "checkpoints" / "last"), weights(tmp_path / "again" / "checkpoints" / "last")
+    assert all(np.array_equal(first[key], second[key]) for key in first)
+
+
+def test_resume_goes_on_with_all_recorded_steps(tmp_path):
+    folder = tmp_path / "run"
+    assert train(*TINY, "--steps=4", f"--output_dir={folder}").returncode == 0
+    result = train("--resume=true", f"--output_dir={folder}", "--steps=8", "--policy.device=cpu")
+    assert result.returncode == 0, result.stderr
+    skills = [(e.actions[:, 2].round(), e.phases) for e in read_episodes(folder / "dataset")]
+    drives = sum(np.count_nonzero((s == Skill.NAVIGATE) & (p == Phase.LEARNING)) for s, p in skills)
+    curriculum = sum(np.count_nonzero((s == Skill.GRASP) & (p == Phase.CURRICULUM)) for s, p in skills)
+    assert (drives, curriculum) == (8, 6), "steps of before count, and the curriculum is not done twice"
+
+
+def test_killed_run_resumes(tmp_path):
+    folder = tmp_path / "run"
+    process = subprocess.Popen(
+        command(*TINY, "--steps=100000", f"--output_dir={folder}"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 90
+    while not (folder / "checkpoints" / "000004").exists():
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    time.sleep(1)  # the writer process finishes what it has received
+    before = summarize(folder / "dataset")
+    steps = json.loads((folder / "checkpoints" / "last" / "training_state" / "training_step.json").read_text())["step"]
+    result = train("--resume=true", f"--output_dir={folder}", f"--steps={steps + 8}", "--policy.device=cpu")
+    assert result.returncode == 0, result.stderr
+    after = summarize(folder / "dataset")
+    assert after.episodes > before.episodes
+    assert after.grasps >= before.grasps
+
+
+BAD = {
+    "curriculum": (["--curriculum.type=nonsense"], "stationary, autonomous, none"),
+    "encoder": (["--policy.navigation_encoder=eyes"], "floor, paper, paper_small"),
+    "backbone": (["--policy.grasp_backbone=dense"], "policy.grasp_backbone=rectified"),
+    "members": (["--policy.num_members=0"], "policy.num_members is 0"),
+    "rate": (["--policy.navigation_learning_rate=-1"], "policy.navigation_learning_rate is -1"),
+    "gamma": (["--policy.gamma=1.5"], "policy.gamma is 1.5"),
+    "steps": (["--steps=0"], "steps is 0"),
+    "policy": (["--policy.type=relmm_random"], "--policy.type=relmm"),
+    "camera": (["--robot.camera=d435"], "--policy.camera=d435"),
+    "unknown camera": (["--policy.camera=fisheye"], "paper, d435"),
+    "room": (["--robot.room=attic"], "no_obstacles"),
+    "device": (["--policy.device=cuda:7"], "--policy.device=cpu"),
+    "init": (["--dataset.init=nowhere/at_all"], "nowhere/at_all"),
+    "resume": (["--resume=true"], "There is no checkpoint"),
+}
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys) -> Callable[..., str]:
+    """The one sentence that a command line ends in; in this process, because importing LeRobot takes seconds."""
+
+    def call(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["relmm-train", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        assert stop.value.code == 2
+        errors = capsys.readouterr().err.strip()
+        assert errors.startswith("relmm-train: ")
+        assert len(errors.splitlines()) == 1
+        return errors
+
+    return call
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD.values(), ids=BAD)
+def test_bad_settings_end_in_one_sentence(tmp_path, refused, arguments, words):
+    folder = tmp_path / "run"
+    replaced = ("--policy.",) if "policy.type" in arguments[0] else (arguments[0].partition("=")[0],)
+    kept = [argument for argument in TINY if not argument.startswith(replaced)]
+    assert words in refused(*kept, *arguments, f"--output_dir={folder}")
+    assert not folder.exists()
+
+
+def test_nothing_to_learn_from_is_refused(tmp_path, refused):
+    assert "--robot.type=locobot_sim" in refused("--policy.device=cpu", f"--output_dir={tmp_path / 'run'}")
