@@ -74,14 +74,17 @@ def read_episodes(root: Path | str, first: int = 0) -> Iterator[Episode]:
 
 
 def _read_all(follower: EpisodeFollower) -> Iterator[Episode]:
-    reached = -1
-    # Again after a problem: a file may have appeared between listing and reading. In vain twice is damage.
-    while follower.next > reached:
-        reached = follower.next
+    stopped_at = None
+    while True:
         yield from follower.read_new()
         if not follower.problem:
             return
-    raise DatasetError(f"{follower.problem}; resume its recording, which repairs it, or restore it from a copy.")
+        # Once may be a file that appeared between listing and reading; twice is damage.
+        if stopped_at == follower.next:
+            raise DatasetError(
+                f"{follower.problem}; resume its recording, which repairs it, or restore it from a copy."
+            )
+        stopped_at = follower.next
 
 
 class EpisodeFollower:
@@ -110,7 +113,7 @@ class EpisodeFollower:
         """The episodes that were saved since the last call; none while there is no dataset.
 
         Raises:
-            DatasetError: the dataset is none that relmm can train on.
+            DatasetError: the dataset is none that relmm can train on, or has a picture that cannot be decoded.
         """
         return list(self.read_new())
 
