@@ -55,11 +55,24 @@ def save_checkpoint(
     generators = {"policy": learner.policy.rng.get_state(), "noise": learner.noise.get_state()}
     save_file(generators, temporary / _STATE / _RANDOM)
     _sync_tree(temporary)
-    if target.exists():  # the same step again, after a resume from an older checkpoint
+    if target.exists():  # the same step again: the link must never point to what is being removed
+        _link(folder / _LAST, temporary.name)
         shutil.rmtree(target)
     os.replace(temporary, target)
     _link(folder / _LAST, target.name)
     return target
+
+
+def _settle(folder: Path) -> None:
+    """Finish what `save_checkpoint` was doing when it was killed while it replaced a checkpoint."""
+    last = folder / _LAST
+    if not last.is_symlink() or not (name := os.readlink(last)).startswith("."):
+        return
+    temporary, target = folder / name, folder / name.removeprefix(".").removesuffix(".tmp")
+    if temporary.exists():
+        shutil.rmtree(target, ignore_errors=True)
+        os.replace(temporary, target)
+    _link(last, target.name)
 
 
 def last_checkpoint(folder: Path) -> Path:
@@ -68,6 +81,7 @@ def last_checkpoint(folder: Path) -> Path:
     Raises:
         ConfigError: there is none.
     """
+    _settle(folder)
     last = folder / _LAST
     if not (last / _MODEL / "config.json").is_file():
         raise ConfigError(f"There is no checkpoint in {folder}: check the folder, or train without --resume.")

@@ -22,6 +22,10 @@ class RecordedEpisode(Protocol):
         """(n, 100, 100, 3)."""
 
     @property
+    def states(self) -> NDArray[np.float32]:
+        """(n, 10)."""
+
+    @property
     def actions(self) -> NDArray[np.float32]:
         """(n, 5)."""
 
@@ -86,11 +90,10 @@ class Learner:
     # --- Recorded episodes --------------------------------------------------------------------------------
     def read(self, episode: RecordedEpisode, update: bool) -> None:
         """Take a recorded episode into the replay; with `update`, learn from each frame as if it had just happened."""
-        for picture, action, reward, phase in zip(
-            episode.images, episode.actions, episode.rewards, episode.phases, strict=True
-        ):
+        columns = (episode.images, episode.states[:, :2], episode.actions, episode.rewards, episode.phases)
+        for picture, motion, action, reward, phase in zip(*columns, strict=True):
             attempts, steps = len(self.replay.attempts), self.replay.navigation_steps
-            self.replay.add(picture, action, bool(reward > 0), int(phase))
+            self.replay.add(picture, motion, action, bool(reward > 0), int(phase))
             if update and len(self.replay.attempts) > attempts:
                 self.update_grasping()
             if update and self.replay.navigation_steps > steps:
@@ -123,14 +126,17 @@ class Learner:
         """Rows of navigation steps as a batch, relabelled by the current ensemble."""
         device, count = self.policy.weights_device, len(steps["frame"])
         frames = np.concatenate([steps["frame"], steps["next"]])
+        motions = torch.from_numpy(self.replay.motions(frames)).to(device)
         observations, probabilities = self.maps.get(frames, self.config.refreshed_maps)
         success = torch.from_numpy(steps["success"]).to(device)
         actions = np.stack([steps["forward"], steps["turn"]], axis=1)
         batch = NavigationBatch(
             observations[:count],
+            motions[:count],
             torch.from_numpy(actions).to(device),
             success.float() - 1,
             observations[count:],
+            motions[count:],
             1 - success.float(),
         )
         return self.policy.relabel(batch, probabilities[count:], ~success)

@@ -77,6 +77,7 @@ class Replay:
         columns = {"frame": np.int64, "next": np.int64, "forward": np.float32, "turn": np.float32, "success": bool}
         self.steps, self.pseudo_reset_steps = Table(**columns), Table(**columns)
         self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)  # no memory until written to
+        self._motions = np.zeros((capacity, 2), np.float32)
         self._open_step: dict[str, float] | None = None  # the last navigation step, until it is known where it led
         self._open_table = self.steps  # that it belongs to
         self._first_attempt: int | None = None  # frame of the first attempt since then
@@ -87,19 +88,23 @@ class Replay:
     ) -> None:
         """Take one frame, as `relmm.episodes.EpisodeRecorder.add_frame` does."""
         values = [action[name] for name in ACTION_NAMES]
-        self.add(observation[FRONT], values, outcome["next.reward"] > 0, int(outcome["complementary_info.phase"]))
+        motion = (observation["x.vel"], observation["theta.vel"])
+        phase = int(outcome["complementary_info.phase"])
+        self.add(observation[FRONT], motion, values, outcome["next.reward"] > 0, phase)
 
-    def add(self, picture: NDArray[np.uint8], action: Any, success: bool, phase: int) -> None:
+    def add(self, picture: NDArray[np.uint8], motion: Any, action: Any, success: bool, phase: int) -> None:
         """Take one frame.
 
         Args:
             picture: (100, 100, 3).
+            motion: how the robot had moved just before, m/s and deg/s.
             action: by `relmm.features.ACTION_NAMES`, length 5.
             success: whether this frame's attempt picked something up.
             phase: a `relmm.features.Phase`.
         """
         frame, self.frames = self.frames, self.frames + 1
         self._pictures[frame % self.capacity] = picture
+        self._motions[frame % self.capacity] = _scaled(*motion)
         x_vel, theta_vel, skill, x, y = (float(value) for value in action)
         if round(skill) == Skill.GRASP:
             self.attempts.append(frame=frame, cell=xy_to_cell(x, y), success=success)
@@ -111,7 +116,7 @@ class Replay:
         self._close_step(frame)
         self.navigation_steps += phase == Phase.LEARNING
         if round(skill) == Skill.NAVIGATE:
-            forward, turn = x_vel / MAX_X_VEL * 2 - 1, theta_vel / MAX_THETA_VEL
+            forward, turn = _scaled(x_vel, theta_vel)
             self._open_step = {"frame": frame, "forward": forward, "turn": turn}
             self._open_table = self.pseudo_reset_steps if phase == Phase.PSEUDO_RESET else self.steps
 
@@ -132,7 +137,16 @@ class Replay:
         """The pictures of frames, uint8 (n, 100, 100, 3)."""
         return self._pictures[frames % self.capacity]
 
+    def motions(self, frames: NDArray[np.int64]) -> NDArray[np.float32]:
+        """How the robot had moved just before, forward and turn, about -1..1, (n, 2)."""
+        return self._motions[frames % self.capacity]
+
     def sample(self, table: Table, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Rows of one of the tables whose pictures are still there, uniformly, with replacement, (count,)."""
         first = int(np.searchsorted(table["frame"], self.frames - self.capacity))
         return rng.integers(first, len(table), count)
+
+
+def _scaled(x_vel: float, theta_vel: float) -> tuple[float, float]:
+    """Forward and turn as the navigation policy counts them, -1..1."""
+    return x_vel / MAX_X_VEL * 2 - 1, theta_vel / MAX_THETA_VEL

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from relmm.features import FRONT, GRID, Phase, Skill, action_dict
+from relmm.features import FRONT, GRID, STATE_NAMES, Phase, Skill, action_dict
 from relmm.learning.curriculum import AutonomousCurriculum, Practice
 from relmm.learning.learner import Learner
 from relmm.learning.life import Life
@@ -125,7 +125,8 @@ class Trainer:
     def _navigation_action(self) -> dict[str, float]:
         if self.progress.steps < self.config.random_steps:
             return drive_anywhere(self._rng)
-        return self.policy.navigate(self._pictures())
+        state = [[self.life.observation[name] for name in STATE_NAMES]]
+        return self.policy.navigate(self._pictures(), torch.tensor(state, device=self.policy.weights_device))
 
     def _pseudo_reset(self) -> None:
         for action in pseudo_reset(self._rng, self._pseudo_reset_steps, lambda: self.life.holding):

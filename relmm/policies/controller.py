@@ -132,11 +132,12 @@ class ControllerPolicy(PreTrainedPolicy):
         self._episodes = 0
 
     @abstractmethod
-    def decide(self, image: NDArray[np.uint8], row: Row) -> dict[str, float]:
+    def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
         """Choose the next action of a robot with empty hands.
 
         Args:
             image: the front camera, (100, 100, 3).
+            state: by `relmm.features.STATE_NAMES`.
             row: what is remembered about this robot.
         """
 
@@ -149,17 +150,17 @@ class ControllerPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> torch.Tensor:
         """One action a robot, float32 (batch, 5), in the order and units of `relmm.features.ACTION_NAMES`."""
         images = (batch[IMAGE_KEY] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
-        holding = (batch[STATE_KEY][:, _HOLDING] > 0.5).tolist()
+        states = batch[STATE_KEY].float().cpu().numpy()
         while len(self._rows) < len(images):
             stream = [self.config.seed or 0, self._episodes + len(self._rows)]
             self._rows.append(Row(np.random.default_rng(stream)))
-        actions = [self._act(*each) for each in zip(images, holding, self._rows, strict=False)]
+        actions = [self._act(*each) for each in zip(images, states, self._rows, strict=False)]
         return torch.tensor([[action[name] for name in ACTION_NAMES] for action in actions])
 
-    def _act(self, image: NDArray[np.uint8], holding: bool, row: Row) -> dict[str, float]:
-        if holding:
+    def _act(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
+        if state[_HOLDING] > 0.5:
             return action_dict(Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
-        action = self.decide(image, row)
+        action = self.decide(image, state, row)
         row.attempts = row.attempts + 1 if action["skill.pos"] == Skill.GRASP else 0
         return action
 

@@ -17,8 +17,8 @@ class RelmmRandomPolicy(UntrainedPolicy):
     name = "relmm_random"
     config: RelmmRandomConfig
 
-    def decide(self, image: NDArray[np.uint8], row: Row) -> dict[str, float]:
-        """See `UntrainedPolicy.decide`; the picture is ignored."""
+    def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
+        """See `ControllerPolicy.decide`; the picture is ignored."""
         driven = row.memory.get("driven", False)
         if driven and row.attempts == 0:
             row.memory["grasping"] = row.rng.random() < self.config.grasp_probability

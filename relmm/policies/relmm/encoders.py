@@ -21,7 +21,8 @@ _CELLS = 5
 _ROWS, _COLUMNS = 32, 33
 _NEAR_ROWS = 1  # pixels of the map before the grasp area
 _JUDGED_ROWS = 20  # of them, up to 1.36 m, get a grasp probability; farther off a picture shows too little
-_MAP_MEMBERS = 1  # of the ensemble, that draw the map
+_MOTION_FEATURES = 64
+_MAP_MEMBERS = 2  # of the ensemble, that draw the map
 
 
 class PictureObserver(nn.Module):
@@ -78,7 +79,9 @@ def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
 
 
 class Encoder(nn.Module):
-    """Convolutions over a navigation observation.
+    """Convolutions over a navigation observation; those over a map of the floor also get the robot's last motion.
+
+    Without it a policy that sees nothing to drive to cannot know which way it has begun to turn, and dithers.
 
     Args:
         kind: as in `ReLMMConfig.navigation_encoder`.
@@ -91,14 +94,20 @@ class Encoder(nn.Module):
         super().__init__()
         shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
         self.layers = nn.Sequential(*_LAYERS[kind](), nn.Flatten())
+        self.motion = nn.Sequential(nn.Linear(2, _MOTION_FEATURES), nn.ReLU()) if kind == "floor" else None
         with torch.no_grad():
-            self.features: int = self.layers(torch.zeros(1, *shape)).shape[1]
+            self.features: int = self(torch.zeros(1, *shape), torch.zeros(1, 2)).shape[1]
 
-    def forward(self, observations: Tensor) -> Tensor:
-        """Observations, uint8 (batch, channels, height, width) -> (batch, features)."""
+    def forward(self, observations: Tensor, motions: Tensor) -> Tensor:
+        """Features, (batch, features).
+
+        Args:
+            observations: uint8, (batch, channels, height, width).
+            motions: forward and turn, about -1..1, (batch, 2).
+        """
         scaled = observations.float() / 127.5 - 1
         encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))
-        return encoded
+        return encoded if self.motion is None else torch.cat([encoded, self.motion(motions)], dim=1)
 
 
 def _paper_layers() -> list[nn.Module]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.features import ACTION_NAMES, IMAGE_KEY, MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict, xy_to_cell
+from relmm.features import ACTION_NAMES, IMAGE_KEY, MAX_THETA_VEL, MAX_X_VEL, STATE_KEY, Skill, action_dict, xy_to_cell
 from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import make_observer
@@ -45,13 +47,13 @@ class ReLMMPolicy(ControllerPolicy):
         self.estimate: Estimate | None = None
 
     # --- Acting -------------------------------------------------------------------------------------------
-    def decide(self, image: NDArray[Any], row: Row) -> dict[str, float]:
+    def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
         """See `ControllerPolicy.decide`: greedily, or as while training if `sampling`."""
         pictures = self.to_pictures(image)
         estimate = self.look(pictures)
         if row.attempts < self.config.num_grasp and self._wants_to_grasp(estimate, row):
             return self.grasp(estimate)
-        return self.navigate(pictures)
+        return self.navigate(pictures, torch.from_numpy(state[None]).to(self.weights_device))
 
     def look(self, pictures: Tensor) -> Estimate:
         """The ensemble's opinion of pictures 0..1 (batch, 3, 100, 100), which is also remembered."""
@@ -68,10 +70,10 @@ class ReLMMPolicy(ControllerPolicy):
         cells = self.grasping.sample(estimate, self.rng) if self.sampling else estimate.mean.argmax(dim=1)
         return grasp_cell(int(cells[0]))
 
-    def navigate(self, pictures: Tensor) -> dict[str, float]:
-        """A navigation step for one picture: the mean action, or a sampled one if `sampling`."""
+    def navigate(self, pictures: Tensor, states: Tensor) -> dict[str, float]:
+        """A navigation step for one picture and state: the mean action, or a sampled one if `sampling`."""
         observations = self.observer(pictures, self.grasping)
-        action = self.navigation.act(observations, self.rng if self.sampling else None)[0]
+        action = self.navigation.act(observations, to_motions(states), self.rng if self.sampling else None)[0]
         return to_navigation_step(action.tolist())
 
     def to_pictures(self, image: NDArray[Any]) -> Tensor:
@@ -94,8 +96,9 @@ class ReLMMPolicy(ControllerPolicy):
         """The losses of the frames of a LeRobot batch: attempts teach the ensemble, navigation steps the navigation.
 
         Args:
-            batch: pictures (batch, time, 3, 100, 100) 0..1, `action` (batch, time, 5) and `next.reward` (batch, time),
-                where time is `config.observation_delta_indices`; the rest is not used.
+            batch: pictures (batch, time, 3, 100, 100) 0..1, `observation.state` (batch, time, 10), `action`
+                (batch, time, 5) and `next.reward` (batch, time), where time is `config.observation_delta_indices`; the
+                rest is not used.
             **kwargs: LeRobot's, not used.
         """
         skills = batch["action"][:, 0, _SKILL].round().long()
@@ -137,23 +140,24 @@ class ReLMMPolicy(ControllerPolicy):
             return batch
         chance = torch.where(relabelled, probabilities, 0.0)
         continues = batch.continues * (1 - chance) if self.config.relabel_terminal else batch.continues
-        return NavigationBatch(
-            batch.observations, batch.actions, batch.rewards + chance, batch.next_observations, continues
-        )
+        return replace(batch, rewards=batch.rewards + chance, continues=continues)
 
     def _navigation_batch(self, batch: dict[str, Any], steps: Tensor) -> NavigationBatch:
-        pictures, actions = batch[IMAGE_KEY][steps], batch["action"][steps]
+        pictures, states, actions = batch[IMAGE_KEY][steps], batch[STATE_KEY][steps], batch["action"][steps]
         attempted = actions[:, 1:, _SKILL].round() == Skill.GRASP
         # Only attempts that follow the step without another step between them are its outcome.
         own = attempted.long().cumprod(dim=1).bool()
         success = (own & (batch["next.reward"][steps][:, 1:] > 0.5)).any(dim=1)
         after = (own.sum(dim=1) + 1).clamp(max=pictures.shape[1] - 1)
-        following = pictures[torch.arange(len(pictures)), after]
+        rows = torch.arange(len(pictures), device=pictures.device)
+        following = pictures[rows, after]
         result = NavigationBatch(
             self.observer(pictures[:, 0], self.grasping),
+            to_motions(states[:, 0]),
             from_navigation_steps(actions[:, 0]),
             success.float() - 1,
             self.observer(following, self.grasping),
+            to_motions(states[rows, after]),
             1 - success.float(),
         )
         probabilities = self.grasping.grasp_probability(self.grasping.estimate(following))
@@ -166,6 +170,11 @@ class ReLMMPolicy(ControllerPolicy):
 def to_navigation_step(action: list[float]) -> dict[str, float]:
     """A navigation step for forward and turn in -1..1; -1 forward stands still, as in the authors' code."""
     return action_dict(x_vel=(action[0] + 1) / 2 * MAX_X_VEL, theta_vel=action[1] * MAX_THETA_VEL)
+
+
+def to_motions(states: Tensor) -> Tensor:
+    """How the robot last moved, forward and turn in about -1..1, (batch, 2), of states (batch, 10)."""
+    return torch.stack([states[:, 0] / MAX_X_VEL * 2 - 1, states[:, 1] / MAX_THETA_VEL], dim=1)
 
 
 def from_navigation_steps(actions: Tensor) -> Tensor:

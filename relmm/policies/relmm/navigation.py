@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -23,22 +23,30 @@ class NavigationBatch:
 
     Attributes:
         observations, next_observations: uint8, (batch, channels, height, width).
+        motions, next_motions: how the robot had moved just before, forward and turn, about -1..1, (batch, 2).
         actions: -1..1, (batch, 2).
         rewards: -1..0, (batch,).
         continues: 1 where the search goes on, 0 after a success, or the probability of that, (batch,).
     """
 
     observations: Tensor
+    motions: Tensor
     actions: Tensor
     rewards: Tensor
     next_observations: Tensor
+    next_motions: Tensor
     continues: Tensor
 
     def mirrored(self) -> NavigationBatch:
         """The same with left and right exchanged; for maps of the floor, whose columns are symmetric."""
-        flipped = self.actions * torch.tensor([1.0, -1.0], device=self.actions.device)
-        return NavigationBatch(
-            self.observations.flip(-1), flipped, self.rewards, self.next_observations.flip(-1), self.continues
+        sign = torch.tensor([1.0, -1.0], device=self.actions.device)
+        return replace(
+            self,
+            observations=self.observations.flip(-1),
+            motions=self.motions * sign,
+            actions=self.actions * sign,
+            next_observations=self.next_observations.flip(-1),
+            next_motions=self.next_motions * sign,
         )
 
 
@@ -89,9 +97,9 @@ class Critics(nn.Module):
         self.features = first.features
         self.heads = nn.ModuleList([_dense_layers(config, self.features + ACTIONS, 1) for _ in range(2)])
 
-    def encode(self, observations: Tensor) -> list[Tensor]:
+    def encode(self, observations: Tensor, motions: Tensor) -> list[Tensor]:
         """Features for each head, two of (batch, features)."""
-        encoded = [encoder(observations) for encoder in self.encoders]
+        encoded = [encoder(observations, motions) for encoder in self.encoders]
         return encoded * 2 if len(encoded) == 1 else encoded
 
     def forward(self, features: list[Tensor], actions: Tensor) -> Tensor:
@@ -118,10 +126,10 @@ class Navigation(nn.Module):
         self.actor = Actor(config, self.critics.features)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.initial_temperature)))
 
-    def act(self, observations: Tensor, rng: torch.Generator | None) -> Tensor:
+    def act(self, observations: Tensor, motions: Tensor, rng: torch.Generator | None) -> Tensor:
         """Actions -1..1, (batch, 2): sampled, or the mean action without random numbers."""
         with torch.no_grad():
-            features = self._actor_features(observations, None)
+            features = self._actor_features(observations, motions)
             if rng is None:
                 mean: Tensor = self.actor(features)[0].tanh()
                 return mean
@@ -140,11 +148,13 @@ class Navigation(nn.Module):
         """
         temperature = self.log_temperature.exp().detach()
         targets = self.bellman_targets(batch, noise[1], temperature)
-        features = self.critics.encode(batch.observations)
+        features = self.critics.encode(batch.observations, batch.motions)
         values = self.critics(features, batch.actions)
         critic_loss = functional.mse_loss(values, targets.expand_as(values))
 
-        actions, log_density = self.actor.sample(self._actor_features(batch.observations, features), noise[0])
+        actions, log_density = self.actor.sample(
+            self._actor_features(batch.observations, batch.motions, features), noise[0]
+        )
         # Through the critics to the actions, but not into the critics.
         self.critics.requires_grad_(False)
         reached = self.critics([each.detach() for each in features], actions).amin(dim=0)
@@ -165,8 +175,9 @@ class Navigation(nn.Module):
     @torch.no_grad()
     def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:
         """R + gamma * (1 - terminal) * (min Q'(o', a') - temperature * log pi(a'|o')), (batch,)."""
-        actions, log_density = self.actor.sample(self._actor_features(batch.next_observations, None), noise)
-        values = self.targets(self.targets.encode(batch.next_observations), actions).amin(dim=0)
+        following = (batch.next_observations, batch.next_motions)
+        actions, log_density = self.actor.sample(self._actor_features(*following), noise)
+        values = self.targets(self.targets.encode(*following), actions).amin(dim=0)
         targets = batch.rewards + self.config.gamma * batch.continues * (values - temperature * log_density)
         return targets.clamp(-1 / (1 - self.config.gamma), 0.0) if self.config.clip_targets else targets
 
@@ -176,11 +187,11 @@ class Navigation(nn.Module):
         for target, weight in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             target.lerp_(weight, self.config.tau)
 
-    def _actor_features(self, observations: Tensor, shared: list[Tensor] | None) -> Tensor:
+    def _actor_features(self, observations: Tensor, motions: Tensor, shared: list[Tensor] | None = None) -> Tensor:
         if self.actor_encoder is not None:
-            features: Tensor = self.actor_encoder(observations)
+            features: Tensor = self.actor_encoder(observations, motions)
             return features
-        return (self.critics.encode(observations) if shared is None else shared)[0].detach()
+        return (self.critics.encode(observations, motions) if shared is None else shared)[0].detach()
 
 
 def _dense_layers(config: ReLMMConfig, inputs: int, outputs: int) -> nn.Sequential:

@@ -83,8 +83,8 @@ class RelmmScriptedPolicy(UntrainedPolicy):
         super().__init__(config, **kwargs)
         self._camera = camera_geometry(config.camera)
 
-    def decide(self, image: NDArray[np.uint8], row: Row) -> dict[str, float]:
-        """See `UntrainedPolicy.decide`."""
+    def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
+        """See `ControllerPolicy.decide`."""
         memory: _Memory = row.memory.setdefault("scripted", _Memory())
         if not memory.look(detect_objects(image, self._camera), self._camera):
             _begin_leaving(memory, row.rng)
