@@ -7,10 +7,10 @@ keeps its parquet files open, unreadable, across episodes. Import this module la
 from __future__ import annotations
 
 import io
-import zlib
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -22,12 +22,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import update_chunk_file_indices
 from numpy.typing import NDArray
 
-# By LeRobot's suffix. PNG: run lengths only, which takes half the time of its level 6 for files of the same size.
-# TIFF (depth): as LeRobot does.
-FORMATS: dict[str, dict[str, Any]] = {
-    ".png": {"format": "PNG", "compress_level": 1, "compress_type": zlib.Z_RLE},
-    ".tiff": {"format": "TIFF", "compression": "raw"},
-}
+# Run lengths of differences to the left neighbour: a sixth of the time of LeRobot's level 6, for files a fifth larger.
+_PNG = (
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
+)
 
 
 class EpisodeWriter(DatasetWriter):
@@ -47,9 +47,7 @@ class EpisodeWriter(DatasetWriter):
         self._pixels: dict[str, NDArray[Any]] = {}
 
     def _save_image(self, image: Any, fpath: Path, compress_level: int = 1) -> None:
-        file = io.BytesIO()
-        image_array_to_pil_image(image).save(file, **FORMATS[fpath.suffix])
-        self._encoded[str(fpath)] = file.getvalue()
+        self._encoded[str(fpath)] = _png(image) if fpath.suffix == ".png" else _tiff(image)
         self._pixels[str(fpath)] = image
 
     def save_episode(self, episode_data: dict | None = None, parallel_encoding: bool = True) -> None:
@@ -62,7 +60,8 @@ class EpisodeWriter(DatasetWriter):
         self._meta.save_episode_tasks(episode_tasks)
         buffer["index"] = np.arange(self._meta.total_frames, self._meta.total_frames + length)
         buffer["episode_index"] = np.full(length, episode)
-        buffer["task_index"] = np.array([self._meta.get_task_index(task) for task in tasks])
+        task_index = {task: self._meta.get_task_index(task) for task in episode_tasks}
+        buffer["task_index"] = np.array([task_index[task] for task in tasks])
         for key, feature in self._meta.features.items():
             if feature["dtype"] != "image":
                 values = np.stack(buffer[key])
@@ -124,6 +123,16 @@ class EpisodeWriter(DatasetWriter):
             flat = pa.array(values.reshape(-1))
             return pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(type_)
         return pa.array(values).cast(type_)
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _PNG)[1])
+
+
+def _tiff(image: NDArray[Any]) -> bytes:
+    file = io.BytesIO()
+    image_array_to_pil_image(image).save(file, format="TIFF", compression="raw")  # as LeRobot does
+    return file.getvalue()
 
 
 def picture_stats(pictures: NDArray[Any], unit: float) -> dict[str, NDArray[Any]]:

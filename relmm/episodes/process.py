@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -14,6 +15,7 @@ from relmm.errors import DatasetError, RelmmError
 
 # The recording process decides when to end; a signal to the whole group must not cut off what it has handed over.
 IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+NICENESS = 10  # the robot loop comes first; when the queue is full it waits, and the writer has the core
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,13 @@ def write_episodes(commands: Connection, replies: Connection, settings: WriterSe
     """Carry out commands until their connection is closed, which also happens when the recording process dies.
 
     Args:
-        commands: where `("frame", frame, task)`, `("save",)` and `("discard",)` come from.
+        commands: where `("frames", [(frame, task), ...])`, `("save",)` and `("discard",)` come from.
         replies: where a `Reply` goes.
         settings: the dataset.
     """
     for number in IGNORED_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+    os.nice(NICENESS)
     saved = 0
     try:
         with settings.start() as dataset:
@@ -74,8 +77,9 @@ def write_episodes(commands: Connection, replies: Connection, settings: WriterSe
 
 
 def _carry_out(dataset: DurableDataset, name: str, arguments: list[Any]) -> None:
-    if name == "frame":
-        dataset.add_frame(*arguments)
+    if name == "frames":
+        for frame, task in arguments[0]:
+            dataset.add_frame(frame, task)
     elif name == "save":
         dataset.save_episode()
     else:

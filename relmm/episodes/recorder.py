@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import multiprocessing
 import queue
 import select
@@ -14,12 +16,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from numpy.typing import NDArray
+
 from relmm.episodes.frames import FrameBuilder
 from relmm.episodes.process import IGNORED_SIGNALS, Reply, WriterSettings, write_episodes
 from relmm.episodes.settings import check_new, check_resume
 from relmm.errors import DatasetError, RelmmError
 
 POLL_S = 0.2  # how often a waiting caller looks whether the writer is still alive
+# Frames handed over at once: waking two threads and a process for each would cost the loop more than the frame itself.
+BATCH_FRAMES = 16
+_PIPE_BYTES = 1 << 20  # a batch and more, so that the writer is not woken in the middle of it; Linux allows this much
 
 
 class EpisodeRecorder:
@@ -71,11 +78,14 @@ class EpisodeRecorder:
         self._root = root
         self._build_frame = FrameBuilder(depth).build
         self._frames = 0  # of the unfinished episode
+        self._batch: list[tuple[dict[str, NDArray[Any]], str]] = []  # those not handed over yet
+        self._batch_frames = min(BATCH_FRAMES, buffered_frames)
         self._closed = False
         self._error: RelmmError | None = None
         self._error_was_raised = False
         self._saved = 0
-        self._start(WriterSettings(root, repo_id, resume, depth, robot_type, info), buffered_frames)
+        settings = WriterSettings(root, repo_id, resume, depth, robot_type, info)
+        self._start(settings, buffered_frames // self._batch_frames)
         try:
             opened = self._wait_for_reply()
         except RelmmError:
@@ -93,7 +103,7 @@ class EpisodeRecorder:
     def add_frame(
         self, observation: Mapping[str, Any], action: Mapping[str, float], outcome: Mapping[str, Any], task: str
     ) -> None:
-        """Hand over a frame; waits when the writer is `buffered_frames` behind.
+        """Record a frame; waits when the writer is `buffered_frames` behind.
 
         Args:
             observation: the robot's: state by name, `front` (100, 100, 3) uint8, `front_depth` (100, 100, 1) uint16 mm.
@@ -104,8 +114,11 @@ class EpisodeRecorder:
         Raises:
             DatasetError: the frame does not fit the dataset, or the writer has failed.
         """
-        self._put(("frame", self._build_frame(observation, action, outcome), task))
+        self._check()
+        self._batch.append((self._build_frame(observation, action, outcome), task))
         self._frames += 1
+        if len(self._batch) == self._batch_frames:
+            self._hand_over()
 
     def save_episode(self) -> None:
         """Ask for the episode to be saved; `flush` waits until it is.
@@ -116,6 +129,7 @@ class EpisodeRecorder:
         self._check()
         if not self._frames:
             raise DatasetError("an episode without frames cannot be saved; add a frame first.")
+        self._hand_over()
         self._put(("save",))
         self._asked += 1
         self._frames = 0
@@ -123,6 +137,7 @@ class EpisodeRecorder:
     def discard_episode(self) -> None:
         """Forget the frames since the last saved episode."""
         self._put(("discard",))
+        self._batch = []
         self._frames = 0
 
     def flush(self) -> None:
@@ -162,9 +177,10 @@ class EpisodeRecorder:
     ) -> None:
         self.close()
 
-    def _start(self, settings: WriterSettings, buffered_frames: int) -> None:
+    def _start(self, settings: WriterSettings, buffered_batches: int) -> None:
         spawn = multiprocessing.get_context("spawn")
         commands_out, commands_in = spawn.Pipe(duplex=False)
+        _widen(commands_in)
         self._replies, replies_in = spawn.Pipe(duplex=False)
         self._process = spawn.Process(
             target=write_episodes, args=(commands_out, replies_in, settings), name="relmm-writer", daemon=False
@@ -177,11 +193,16 @@ class EpisodeRecorder:
         replies_in.close()
         self._poll = select.poll()  # kept, because Connection.poll builds a selector each time, which costs 20 us
         self._poll.register(self._replies.fileno(), select.POLLIN)
-        self._queue: queue.Queue[tuple[Any, ...] | None] = queue.Queue(maxsize=buffered_frames)
+        self._queue: queue.Queue[tuple[Any, ...] | None] = queue.Queue(maxsize=buffered_batches)
         feeder = threading.Thread(target=_feed, args=(self._queue, commands_in), name="relmm-feeder", daemon=True)
         feeder.start()
         # Also when the interpreter ends without `close`: multiprocessing then waits for the writer, which waits for us.
         self._finish = Finalize(self, _end_feeding, args=(self._queue, feeder), exitpriority=10)
+
+    def _hand_over(self) -> None:
+        if self._batch:
+            batch, self._batch = self._batch, []
+            self._put(("frames", batch))
 
     def _put(self, message: tuple[Any, ...]) -> None:
         self._check()
@@ -239,6 +260,12 @@ class EpisodeRecorder:
                 f"the process that writes {self._root} has ended (exit code {self._process.exitcode}); the "
                 f"{self._saved} episodes saved so far are whole: resume to continue."
             )
+
+
+def _widen(pipe: Connection) -> None:
+    if hasattr(fcntl, "F_SETPIPE_SZ"):
+        with contextlib.suppress(OSError):  # a system may allow less: then it stays as it is
+            fcntl.fcntl(pipe.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
 
 def _feed(messages: queue.Queue[tuple[Any, ...] | None], commands: Connection) -> None:

@@ -174,7 +174,7 @@ class LocobotRobot(Robot):
 
         Returns:
             What was really done: clipped to the ranges of `relmm.features`; a grasp with a full gripper and a placement
-            with an empty one become a navigation step that stands still.
+            with an empty one, or where something is in the arm's way, become a navigation step that stands still.
 
         Raises:
             RobotError: an unknown skill, or a value that is not a finite number. Nothing has moved then.
@@ -209,6 +209,9 @@ class LocobotRobot(Robot):
             return action_dict(Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
         x, y = _clip(x, GRASP_X), _clip(y, GRASP_Y)
         self.skills.place(x, y)
+        if self.skills.holding:
+            logger.warning("Nothing was placed: something is in the arm's way.")
+            return action_dict()
         return action_dict(Skill.PLACE, x=x, y=y)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from relmm.features import BASKET_XY, DRIVE_PULSE_S, MAX_THETA_VEL, NAVIGATION_STEP_S, FloatArray
 from relmm.geometry import arm_inverse
 from relmm.robot.body import MAX_OPENING, Body
-from relmm.robot.sensing import ObstacleDetector, grips_something, sees_held_object
+from relmm.robot.sensing import ContactDetector, ObstacleDetector, grips_something, sees_held_object
 
 logger = logging.getLogger(__name__)
 
@@ -25,14 +26,17 @@ _DOWN = np.pi / 2  # rad, tool pitch
 # the bumper meets a wall before they do, and out of the camera's view.
 REST_POSE = arm_inverse(0.15, 0.0, 0.15, pitch=1.3)
 PRESENT_POSE = arm_inverse(0.42, 0.0, 0.20, pitch=0.0)  # gripper level in front of the camera, floor far behind it
+# On the way there; straight from the floor to it the arm would swing 4 cm beyond both.
+_RAISED_POSE = arm_inverse(0.36, 0.0, 0.18, pitch=0.6)
 _ABOVE_Z, _GRASP_Z, _PLACE_Z = 0.10, 0.014, 0.018  # m, of the point between the pads
 _IN_BASKET = arm_inverse(*BASKET_XY, 0.235, pitch=_DOWN)
 _OVER_BASKET = arm_inverse(*BASKET_XY, 0.31, pitch=_DOWN)
 _BESIDE_BASKET = np.array([0.0, *_OVER_BASKET[1:]])  # the same height in front: the waist turns over the basket's rim
 _SQUEEZE = -0.005  # m, an opening that cannot be reached, so that the fingers press with all their force
 
-_WATCH_S = 0.04  # s between looks at the bumper and at the arm's tracking error
-_MAX_TRACKING_ERROR = 0.22  # rad; the servos lag 0.15 at full speed, more means that the arm pushes against something
+_WATCH_S = 0.04  # s between looks at the bumper and at what the arm may meet
+_WAY_POINTS = (0.25, 0.5, 0.75, 1.0)  # of an arm motion that is looked at beforehand
+_REST_ATTEMPTS = 3
 _MAX_JOINT_SPEED = 3.0  # rad/s; the motors' limit is pi
 _CARRY_JOINT_SPEED = 2.0  # rad/s with something in the gripper; at 3 every tenth thing slips out on its way
 _MIN_MOVE_S = 0.36  # s
@@ -71,7 +75,8 @@ class Skills:
 
     def rest(self) -> None:
         """Fold the arm for driving."""
-        self._move(REST_POSE)
+        if not any(self._move(REST_POSE) for _ in range(_REST_ATTEMPTS)):
+            logger.warning("Something keeps the arm from folding.")
 
     def navigate(self, x_vel: float, theta_vel: float) -> None:
         """One navigation step: a drive pulse, a brake, and a turn away from what stands in the way.
@@ -92,27 +97,31 @@ class Skills:
     def grasp(self, x: float, y: float) -> bool:
         """Try to pick up what lies at a point of the floor (m, robot frame), and say whether it worked.
 
-        A failed attempt ends at rest with open fingers, a successful one at rest with the object held.
+        A failed attempt ends at rest with open fingers, a successful one at rest with the object held. Where something
+        stands in the arm's way nothing moves, and where the arm meets something it goes back: the attempt has failed.
         """
+        above = arm_inverse(x, y, _ABOVE_Z, _DOWN)
+        if self._obstructs(REST_POSE, above, _RAISED_POSE, PRESENT_POSE):
+            return False
         self._open()
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
-        self._move(arm_inverse(x, y, _GRASP_Z, _DOWN))
-        self._body.set_gripper(_SQUEEZE)
-        self._closed = True
-        self._wait(0.3)
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
-        self._grasped = grips_something(self._body.state().gripper) and self._present()
+        self._grasped = self._close_at(x, y, above) and self._present()
         if not self._grasped:
             self._open()
         self.rest()
         return self.holding
 
     def place(self, x: float, y: float) -> None:
-        """Put the held object down at a point of the floor (m, robot frame)."""
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
-        self._move(arm_inverse(x, y, _PLACE_Z, _DOWN))
-        self._release()
-        self._move(arm_inverse(x, y, _ABOVE_Z, _DOWN))
+        """Put the held object down at a point of the floor (m, robot frame).
+
+        It stays held where something stands in the arm's way, or where the arm meets something before it is there.
+        """
+        above = arm_inverse(x, y, _ABOVE_Z, _DOWN)
+        if self._obstructs(REST_POSE, above):
+            return
+        if self._move(above):
+            self._move(arm_inverse(x, y, _PLACE_Z, _DOWN))
+            self._release()
+            self._move(above)
         self.rest()
 
     def place_in_basket(self) -> None:
@@ -122,6 +131,20 @@ class Skills:
         self._release()
         for pose in (_OVER_BASKET, _BESIDE_BASKET, REST_POSE):
             self._move(pose)
+
+    def _obstructs(self, *poses: FloatArray) -> bool:
+        """Whether the camera sees something on the arm's way through these poses."""
+        way = [start + part * (end - start) for start, end in pairwise(poses) for part in _WAY_POINTS]
+        return self._detector.obstructs_arm(self.picture()[1], way)
+
+    def _close_at(self, x: float, y: float, above: FloatArray) -> bool:
+        """Close the open fingers round what lies there and lift it; whether there is something between them."""
+        if not (self._move(above) and self._move(arm_inverse(x, y, _GRASP_Z, _DOWN))):
+            return False
+        self._body.set_gripper(_SQUEEZE)
+        self._closed = True
+        self._wait(0.3)
+        return self._move(above) and grips_something(self._body.state().gripper)
 
     def _open(self) -> None:
         self._body.set_gripper(MAX_OPENING)
@@ -134,9 +157,9 @@ class Skills:
 
     def _present(self) -> bool:
         """Lift the gripper into view and look whether something is between the pads."""
-        self._move(PRESENT_POSE)
+        arrived = self._move(_RAISED_POSE) and self._move(PRESENT_POSE)
         state = self._body.state()
-        return sees_held_object(self.picture()[1], self._body.camera, state.joints, state.gripper)
+        return arrived and sees_held_object(self.picture()[1], self._body.camera, state.joints, state.gripper)
 
     def _turn_until_clear(self, at_least_once: bool) -> None:
         direction = 0.0
@@ -166,20 +189,19 @@ class Skills:
         self._body.drive(0.0, 0.0)
         self._wait(NAVIGATION_STEP_S - DRIVE_PULSE_S)
 
-    def _move(self, joints: FloatArray) -> None:
-        """Move the arm as fast as its joints may turn, and stop it where it meets resistance."""
+    def _move(self, joints: FloatArray) -> bool:
+        """Move the arm as fast as its joints may turn, stop it where it meets resistance; whether it has arrived."""
         state = self._body.state()
         speed = _CARRY_JOINT_SPEED if self._closed and grips_something(state.gripper) else _MAX_JOINT_SPEED
         distance = np.max(np.abs(joints - state.joints))
         seconds = max(1.5 * distance / speed, _MIN_MOVE_S)  # a smooth profile peaks at 1.5 times its mean
+        contact = ContactDetector(state)
         self._body.move_arm(joints, seconds)
-        if self._watch(seconds, self._arm_blocked):
+        stopped = self._watch(seconds, lambda: contact.touches(self._body.state()))
+        if stopped:
             self._body.move_arm(self._body.state().joints, _WATCH_S)
         self._wait(0.1)
-
-    def _arm_blocked(self) -> bool:
-        state = self._body.state()
-        return bool(np.max(np.abs(state.joints - state.joint_goal)) > _MAX_TRACKING_ERROR)
+        return not stopped and not contact.touches(self._body.state())
 
     def _watch(self, seconds: float, condition: Callable[[], bool]) -> bool:
         """Let time pass until a condition holds; whether it did."""

@@ -40,7 +40,7 @@ class Basket:
 
     def stow(self, indices: NDArray[np.intp]) -> None:
         """Carry these objects (their numbers in the room), too, from where they are now."""
-        for index in np.setdiff1d(indices, self._stowed):
+        for index in sorted(set(indices.tolist()).difference(self._stowed.tolist())):
             body = self._objects[index]
             offset, rotation, inverse = np.zeros(3), np.zeros(4), np.zeros(4)
             mujoco.mju_negQuat(inverse, self._data.xquat[self._base])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import mujoco
 import numpy as np
@@ -21,6 +22,7 @@ _BASKET_SIZE = (0.060, 0.045)  # m, half the basket's inner length and width
 _BASKET_HEIGHT = (0.11, 0.24)  # m
 _MAX_TILT = 0.94  # cosine; 20 degrees
 _FALLEN_BELOW = -0.02  # m
+_NONE = np.array([], np.intp)
 
 
 class Truth:
@@ -32,6 +34,7 @@ class Truth:
         self.object_ids = np.array([i for i, name in enumerate(names) if name.startswith(OBJECT_PREFIX)])
         self._base = model.body(ROBOT + "base").id
         self._tool = model.site(ROBOT + "tool").id
+        self._limits = np.array([room.size[0] / 2, room.size[1] / 2])
         self._reported: set[int] = set()
 
     def objects(self) -> FloatArray:
@@ -63,9 +66,12 @@ class Truth:
 
     def lost(self) -> NDArray[np.intp]:
         """Numbers of the objects that physics has let through a wall or the floor."""
-        x, y, z = self.objects().T
-        half_x, half_y = np.array(self._room.size) / 2
-        return np.flatnonzero((np.abs(x) > half_x) | (np.abs(y) > half_y) | (z < _FALLEN_BELOW))
+        objects = self._data.xpos[self.object_ids]
+        outside = np.abs(objects[:, :2]) > self._limits
+        fallen = objects[:, 2] < _FALLEN_BELOW
+        if not outside.any() and not fallen.any():  # nearly always, and this is asked at every wait
+            return _NONE
+        return np.flatnonzero(outside.any(axis=1) | fallen)
 
     def check(self) -> None:
         """Report what cannot be.
@@ -73,12 +79,13 @@ class Truth:
         Raises:
             PhysicsError: numbers are no longer finite, or the robot has fallen over or left the room.
         """
-        if not np.isfinite(self._data.qpos.sum() + self._data.qvel.sum()):
+        qpos, qvel = self._data.qpos, self._data.qvel
+        if not math.isfinite(qpos @ qpos + qvel @ qvel):  # the cheapest way to look at every number
             raise PhysicsError(f"The simulation became unstable at {self._data.time:.2f} s; please report the seed.")
-        x, y = self._data.xpos[self._base][:2]
+        x, y = self._data.xpos[self._base, :2].tolist()
         if abs(x) > self._room.size[0] / 2 or abs(y) > self._room.size[1] / 2:
             raise PhysicsError(f"The robot left the room at ({x:.2f}, {y:.2f}) m, {self._data.time:.2f} s.")
-        if self._data.xmat[self._base][8] < _MAX_TILT:
+        if self._data.xmat[self._base, 8] < _MAX_TILT:
             raise PhysicsError(f"The robot tipped over at {self._data.time:.2f} s.")
         for index in set(self.lost().tolist()) - self._reported:
             self._reported.add(index)

@@ -5,10 +5,12 @@ import resource
 import signal
 import time
 
+import numpy as np
 import pytest
-from episode_helpers import INFO, REPO_ID, TASK, arguments, check_dataset, length_of, new_dataset
+from episode_helpers import INFO, REPO_ID, TASK, action, arguments, check_dataset, length_of, load, new_dataset
 
 from relmm.episodes import EpisodeRecorder, summarize
+from relmm.episodes.recorder import BATCH_FRAMES
 from relmm.errors import ConfigError, DatasetError
 
 SETTINGS = {"depth": False, "robot_type": "locobot_sim", "info": INFO}
@@ -60,6 +62,22 @@ def test_the_unfinished_episode_is_saved_where_asked(tmp_path, capfd):
         interrupted()
     check_dataset(tmp_path / "d", 2)
     assert capfd.readouterr().err == ""
+
+
+def test_episodes_of_any_length_arrive_in_order_and_without_what_was_discarded(tmp_path):
+    """Frames travel in batches: shorter, equal and longer ones, and a discard in the middle of one."""
+    lengths = (1, BATCH_FRAMES, BATCH_FRAMES + 1, 3 * BATCH_FRAMES - 1)
+    with EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, **SETTINGS) as recorder:
+        for episode, length in enumerate(lengths):
+            add_episode(recorder, 99, steps=BATCH_FRAMES + 3)
+            recorder.discard_episode()
+            add_episode(recorder, episode, steps=length)
+            recorder.save_episode()
+    dataset = load(tmp_path / "d")
+    assert [dataset.meta.episodes[i]["length"] for i in range(len(lengths))] == list(lengths)
+    actions = np.asarray(dataset.hf_dataset["action"])
+    expected = [list(action(e, s).values()) for e, length in enumerate(lengths) for s in range(length)]
+    np.testing.assert_allclose(actions, expected, rtol=1e-6)
 
 
 @pytest.mark.slow

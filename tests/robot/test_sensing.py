@@ -3,9 +3,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relmm.geometry import CAMERAS, CameraGeometry, arm_forward
-from relmm.robot.sensing import OBSTACLE_RADIUS, ObstacleDetector, grips_something, sees_held_object
-from relmm.robot.skills import PRESENT_POSE
+from relmm.geometry import CAMERAS, CameraGeometry, arm_forward, arm_inverse
+from relmm.robot.body import BodyState
+from relmm.robot.sensing import (
+    OBSTACLE_RADIUS,
+    ContactDetector,
+    ObstacleDetector,
+    grips_something,
+    sees_held_object,
+)
+from relmm.robot.skills import PRESENT_POSE, REST_POSE
+
+REACHING = arm_inverse(0.40, 0.0, 0.10, pitch=np.pi / 2)
 
 
 @pytest.fixture(params=CAMERAS)
@@ -97,3 +106,55 @@ def test_a_few_noisy_pixels_do_not_obstruct(camera: CameraGeometry) -> None:
     chosen = np.random.default_rng(0).choice(len(rows), 3, replace=False)
     depth[rows[chosen], columns[chosen]] = wall[rows[chosen], columns[chosen]]
     assert not ObstacleDetector(camera).obstructed(depth)
+
+
+# --- The arm's way -------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("front", [0.36, 0.40])
+def test_a_wall_through_the_arm_obstructs_it(camera: CameraGeometry, front: float) -> None:
+    assert ObstacleDetector(camera).obstructs_arm(box_depth(camera, front, 2.0, 1.0), [REACHING])
+
+
+def test_one_obstructed_pose_is_enough(camera: CameraGeometry) -> None:
+    depth = box_depth(camera, 0.38, 2.0, 1.0)
+    assert not ObstacleDetector(camera).obstructs_arm(depth, [REST_POSE])
+    assert ObstacleDetector(camera).obstructs_arm(depth, [REST_POSE, REACHING])
+
+
+@pytest.mark.parametrize(("front", "half_width", "top"), [(0.45, 2.0, 1.0), (1.0, 2.0, 1.0), (0.36, 0.5, 0.06)])
+def test_what_is_farther_away_or_as_low_as_objects_does_not_obstruct_the_arm(
+    camera: CameraGeometry, front: float, half_width: float, top: float
+) -> None:
+    assert not ObstacleDetector(camera).obstructs_arm(box_depth(camera, front, half_width, top), [REACHING])
+
+
+def test_what_stands_beside_the_arm_does_not_obstruct_it(camera: CameraGeometry) -> None:
+    post = box_depth(camera, 0.36, 0.03, 0.3)
+    beside = arm_inverse(0.38, 0.14, 0.10, pitch=np.pi / 2)
+    assert ObstacleDetector(camera).obstructs_arm(post, [REACHING])
+    assert not ObstacleDetector(camera).obstructs_arm(post, [beside])
+
+
+def test_bare_floor_and_nothing_measured_do_not_obstruct_the_arm(camera: CameraGeometry) -> None:
+    for depth in (floor_depth(camera), np.zeros(camera.size[::-1], np.uint16)):
+        assert not ObstacleDetector(camera).obstructs_arm(depth, [REACHING, PRESENT_POSE])
+
+
+# --- Stopping on contact -------------------------------------------------------------------------------------
+def state(joint: float, goal: float, travelled: float = 0.0, heading: float = 0.0) -> BodyState:
+    return BodyState(0.0, travelled, heading, np.full(5, joint), np.full(5, goal), 0.04, 0)
+
+
+def test_a_fast_arm_that_trails_its_goal_by_one_look_meets_nothing() -> None:
+    contact = ContactDetector(state(0.0, 0.0))
+    assert not any(contact.touches(state(0.12 * max(look - 1, 0), 0.12 * look)) for look in range(10))
+
+
+def test_an_arm_that_stays_behind_meets_something() -> None:
+    contact = ContactDetector(state(0.0, 0.0))
+    assert [contact.touches(state(0.0, 0.05 * look)) for look in range(4)] == [False, False, False, True]
+
+
+@pytest.mark.parametrize(("travelled", "heading", "touches"), [(-0.003, 0, True), (0, 2, True), (-0.0005, 0.5, False)])
+def test_an_arm_that_pushes_the_base_away_meets_something(travelled: float, heading: float, touches: bool) -> None:
+    contact = ContactDetector(state(0.0, 0.0))
+    assert contact.touches(state(0.0, 0.0, travelled, heading)) == touches
