@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from importlib.resources import files
 from pathlib import Path
+
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 PRESETS = ("fast", "paper", "paper_small")
 _OPTION = "--config_path="
@@ -12,6 +15,13 @@ _OPTION = "--config_path="
 def preset_path(name: str) -> Path:
     """The file of a preset."""
     return Path(str(files("relmm.policies.relmm"))) / "presets" / f"{name}.json"
+
+
+def load_preset(name: str) -> ReLMMConfig:
+    """A preset as a policy's config."""
+    settings = json.loads(preset_path(name).read_text(encoding="utf-8"))["policy"]
+    settings.pop("type")
+    return ReLMMConfig(**settings)
 
 
 def resolve_config_path(arguments: list[str]) -> None:

@@ -223,7 +223,7 @@ def _recorder(run: Run, robot: LocobotRobot) -> EpisodeRecorder:
 
 def _person(robot: LocobotRobot, seed: int) -> Callable[[], bool]:
     if isinstance(robot, LocobotSim):
-        return Person(robot.body, np.random.default_rng([seed, _PERSON_STREAM])).put_in_reach
+        return Person(robot, np.random.default_rng([seed, _PERSON_STREAM])).put_in_reach
     return lambda: False
 
 

@@ -73,6 +73,10 @@ class Skills:
             self._picture = self._body.capture()
         return self._picture
 
+    def forget_picture(self) -> None:
+        """Take a new picture next time, because someone else has changed the room."""
+        self._picture = None
+
     def rest(self) -> None:
         """Fold the arm for driving."""
         if not any(self._move(REST_POSE) for _ in range(_REST_ATTEMPTS)):
