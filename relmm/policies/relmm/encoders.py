@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +22,11 @@ _CELLS = 5
 _ROWS, _COLUMNS = 32, 33
 _NEAR_ROWS = 1  # pixels of the map before the grasp area
 _JUDGED_ROWS = 20  # of them, up to 1.36 m, get a grasp probability; farther off a picture shows too little
-_MOTION_FEATURES = 64
+_PIXEL = 0.054  # m
+_HEADS = 8
+_INITIAL_ATTENTION = 6.0  # score of a certain grasp; -6 for a hopeless one
+_POINT_FEATURES = 256
+_CONVOLUTION_FEATURES = 128
 _MAP_MEMBERS = 2  # of the ensemble, that draw the map
 
 
@@ -78,10 +83,41 @@ def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
     return FloorObserver(config) if config.navigation_encoder == "floor" else PictureObserver()
 
 
-class Encoder(nn.Module):
-    """Convolutions over a navigation observation; those over a map of the floor also get the robot's last motion.
+class Keypoints(nn.Module):
+    """A few points of the map that matter, by soft attention: where each is, and how graspable.
 
-    Without it a policy that sees nothing to drive to cannot know which way it has begun to turn, and dithers.
+    Convolutions need many updates to learn positions (Levine et al. 2016 hence take a spatial softmax). Attention looks
+    at first at the graspable thing that is nearest to the grasp area, and learns from there.
+    """
+
+    features = 3 * _HEADS
+
+    def __init__(self) -> None:
+        super().__init__()
+        rows = (torch.arange(_ROWS) - _NEAR_ROWS - 1) * _PIXEL  # m from the middle of the grasp area
+        columns = (torch.arange(_COLUMNS) - _COLUMNS // 2) * _PIXEL
+        x, y = torch.meshgrid(rows, columns, indexing="ij")
+        self.places: Tensor
+        self.register_buffer("places", torch.stack([x, y]).flatten(1), persistent=False)
+        self.look = nn.Conv2d(FloorObserver.shape[0], _HEADS, 1, bias=False)
+        with torch.no_grad():
+            self.look.weight.mul_(0.1)
+            self.look.weight[:, 0] = _INITIAL_ATTENTION
+        reach = torch.logspace(-1, 0, _HEADS)[:, None]  # m, how far each head looks before it prefers the nearer
+        self.prefer = nn.Parameter(-self.places.norm(dim=0) / reach)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Maps in -1..1, (batch, 4, 32, 33) -> x and y in m and graspability of each point, (batch, 3 * heads)."""
+        attention = (self.look(maps).flatten(2) + self.prefer).softmax(dim=-1)
+        graspable = maps[:, :1].flatten(2)
+        values = torch.cat([self.places.expand(len(maps), -1, -1), graspable], dim=1)
+        return torch.einsum("bhp,bvp->bhv", attention, values).flatten(1)
+
+
+class Encoder(nn.Module):
+    """Features of a navigation observation: convolutions; over a map of the floor also keypoints and the last motion.
+
+    Without the motion a policy that sees nothing to drive to cannot know which way it has begun to turn, and dithers.
 
     Args:
         kind: as in `ReLMMConfig.navigation_encoder`.
@@ -94,7 +130,10 @@ class Encoder(nn.Module):
         super().__init__()
         shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
         self.layers = nn.Sequential(*_LAYERS[kind](), nn.Flatten())
-        self.motion = nn.Sequential(nn.Linear(2, _MOTION_FEATURES), nn.ReLU()) if kind == "floor" else None
+        self.on_floor = kind == "floor"
+        if self.on_floor:
+            self.keypoints = Keypoints()
+            self.embed = nn.Sequential(nn.Linear(Keypoints.features + 2, _POINT_FEATURES), nn.ReLU())
         with torch.no_grad():
             self.features: int = self(torch.zeros(1, *shape), torch.zeros(1, 2)).shape[1]
 
@@ -107,7 +146,10 @@ class Encoder(nn.Module):
         """
         scaled = observations.float() / 127.5 - 1
         encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))
-        return encoded if self.motion is None else torch.cat([encoded, self.motion(motions)], dim=1)
+        if not self.on_floor:
+            return encoded
+        points = self.embed(torch.cat([self.keypoints(scaled), motions], dim=1))
+        return torch.cat([encoded, points], dim=1)
 
 
 def _paper_layers() -> list[nn.Module]:
@@ -123,12 +165,15 @@ def _paper_small_layers() -> list[nn.Module]:
 
 
 def _floor_layers() -> list[nn.Module]:
-    widths = (4, 32, 64, 64)
-    return [
+    widths = (FloorObserver.shape[0], 32, 64, 64)
+    convolutions = [
         layer
         for inputs, outputs in pairwise(widths)
         for layer in (nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU())
     ]
+    pixels = widths[-1] * math.ceil(_ROWS / 8) * math.ceil(_COLUMNS / 8)
+    features = _CONVOLUTION_FEATURES
+    return [*convolutions, nn.Flatten(), nn.Linear(pixels, features), nn.LayerNorm(features), nn.ReLU()]
 
 
 _LAYERS: dict[str, Any] = {"paper": _paper_layers, "paper_small": _paper_small_layers, "floor": _floor_layers}
