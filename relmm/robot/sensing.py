@@ -33,7 +33,8 @@ _FINGERTIP = 0.012  # m beyond the point between the pads
 # --- Stopping on contact -------------------------------------------------------------------------------------
 # Over 46,000 looks at normal grasps and placements in the four rooms: 0.032 rad, 0.4 mm and 0.4 degrees at most.
 _MAX_LAG = 0.06  # rad between the joints and where they were to be a look earlier; the servos trail by about that time
-# m and degrees that the base seems to move by its wheels while the arm does; pushed, it slides ten times as far.
+# m back and degrees that the base seems to move by its wheels while the arm does; pushed, it slides ten times as far.
+# Never forward: the arm reaches ahead, and a base that creeps over an object under it may go either way.
 _MAX_SHOVE, _MAX_SWIVEL = 0.0015, 1.5
 
 
@@ -141,5 +142,5 @@ class ContactDetector:
         """Whether something stops the arm; `state` is the sensors now."""
         lag = float(np.abs(state.joints - self._goal).max())
         self._goal = state.joint_goal
-        shove, swivel = state.travelled - self._start.travelled, state.heading - self._start.heading
-        return lag > _MAX_LAG or abs(shove) > _MAX_SHOVE or abs(swivel) > _MAX_SWIVEL
+        shove, swivel = self._start.travelled - state.travelled, state.heading - self._start.heading
+        return lag > _MAX_LAG or shove > _MAX_SHOVE or abs(swivel) > _MAX_SWIVEL

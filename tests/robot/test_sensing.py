@@ -154,7 +154,9 @@ def test_an_arm_that_stays_behind_meets_something() -> None:
     assert [contact.touches(state(0.0, 0.05 * look)) for look in range(4)] == [False, False, False, True]
 
 
-@pytest.mark.parametrize(("travelled", "heading", "touches"), [(-0.003, 0, True), (0, 2, True), (-0.0005, 0.5, False)])
+@pytest.mark.parametrize(
+    ("travelled", "heading", "touches"), [(-0.003, 0, True), (0, 2, True), (-0.0005, 0.5, False), (0.003, 0, False)]
+)
 def test_an_arm_that_pushes_the_base_away_meets_something(travelled: float, heading: float, touches: bool) -> None:
     contact = ContactDetector(state(0.0, 0.0))
     assert contact.touches(state(0.0, 0.0, travelled, heading)) == touches
