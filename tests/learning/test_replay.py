@@ -10,9 +10,8 @@ from relmm.features import FRONT, GRID, MAX_THETA_VEL, MAX_X_VEL, Phase, Skill, 
 from relmm.learning.replay import Replay, Table
 from relmm.policies.controller import grasp_cell
 
-Life = list[
-    str
-]  # episodes of drives (d), drives of pseudo-resets (r), attempts that fail (f) or not (s), placements (p)
+# Episodes of drives (d), drives of pseudo-resets (r), attempts that fail (f) or do not (s), and placements (p).
+Life = list[str]
 SKILLS = {"d": Skill.NAVIGATE, "r": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
 Fill = Callable[..., Replay]
 
