@@ -2,14 +2,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
 from numpy.typing import NDArray
+from torch.utils.data import default_collate
 
-from relmm.features import GRID, Phase, Skill, cell_to_xy
+import relmm.plugin  # noqa: F401
+from relmm.features import FPS, GRID, IMAGE_KEY, Phase, Skill, cell_to_xy
 from relmm.geometry import CAMERAS
 from relmm.learning.learner import Learner
 from relmm.learning.maps import to_pictures
@@ -20,6 +25,8 @@ from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 
 SKILLS = {"d": Skill.NAVIGATE, "r": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
 SMALL = {"grasp_batch_size": 8, "navigation_batch_size": 8, "min_attempts_to_update": 3, "min_steps_to_update": 3}
+
+RECORDED = Path(__file__).parents[2] / "datasets" / "diverse_scripted"
 
 MakeLearner = Callable[..., Learner]
 
@@ -232,6 +239,43 @@ def test_frozen_ensemble_learns_from_recorded_curricula_only(make_learner, recor
     counts = count_steps(learner)
     learner.read(recorded("dfffd", Phase.LEARNING), update=True)
     assert counts["grasping"] == 0
+
+
+def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> None:
+    """LeRobot's dataset, batches and preprocessor against the replay, on recorded episodes."""
+    policy = make_policy(refreshed_maps=0, seed=2)
+    deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
+    columns = dict.fromkeys((IMAGE_KEY, "action", "next.reward"), deltas)
+    frames = list(LeRobotDataset("local/diverse", root=RECORDED, delta_timestamps=columns, episodes=[0, 1, 2]))
+    learner, episode = Learner(policy, Replay(len(frames)), seed=0), 0
+    for frame in frames:
+        if frame["episode_index"] != episode:
+            learner.replay.save_episode()
+        episode = frame["episode_index"]
+        picture = (frame[IMAGE_KEY][0] * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+        phase = int(frame["complementary_info.phase"])
+        learner.replay.add(picture, frame["action"][0], bool(frame["next.reward"][0] > 0), phase)
+    learner.replay.save_episode()
+    policy.eval()
+
+    batch = make_pre_post_processors(policy.config)[0](default_collate(frames))
+    torch.manual_seed(3)
+    loss, logs = policy.forward(batch)
+
+    replay = learner.replay
+    every = [table.rows(np.arange(len(table))) for table in (replay.steps, replay.pseudo_reset_steps)]
+    rows = {name: np.concatenate([part[name] for part in every]) for name in every[0]}
+    order = np.argsort(rows["frame"])
+    steps = learner.navigation_batch({name: column[order] for name, column in rows.items()})
+    torch.manual_seed(3)
+    navigation_loss, wanted = policy.navigation.loss(steps, torch.randn(2, len(order), 2))
+    pictures = to_pictures(replay.pictures(replay.attempts["frame"]), torch.device("cpu"))
+    cells, successes = (torch.from_numpy(replay.attempts[name]) for name in ("cell", "success"))
+    grasp_loss = policy.grasping.loss(pictures, cells, successes)
+    assert successes.any()
+    assert len(order) > 20
+    assert logs == pytest.approx({"grasp_loss": grasp_loss.item(), **wanted}, rel=1e-3)
+    assert loss.item() == pytest.approx((grasp_loss + navigation_loss).item(), rel=1e-3)
 
 
 # --- It learns -----------------------------------------------------------------------------------------------
