@@ -1,0 +1,362 @@
+"""The trainer against the paper's algorithms, written out as they stand there, on a robot with scripted outcomes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from relmm.features import FRONT, GRID, Phase, Skill, action_dict, in_grasp_area, xy_to_cell
+from relmm.learning.life import Life
+from relmm.learning.progress import Progress
+from relmm.learning.trainer import Trainer
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+
+PSEUDO_RESET_STEPS = 3
+SAMPLED_CELL = 99  # that the ensemble would choose
+POLICY_DRIVE = action_dict(x_vel=0.123, theta_vel=45.6)  # that the navigation would choose
+
+Event = tuple[str, Phase | None]
+DRIVE, GRASP, DROP = (("drive", Phase.LEARNING), ("grasp", Phase.LEARNING), ("place", Phase.CURRICULUM))
+PRACTICE = ("grasp", Phase.CURRICULUM)
+LEARN_GRASP, LEARN_DRIVE = ("learn to grasp", None), ("learn to drive", None)
+
+
+@dataclass
+class World:
+    """A robot whose grasps succeed, and whose pictures ask for a grasp, by chance; and what happened to it.
+
+    `grasp_wanted` is what P[grasp] of the next pictures is: it changes with every drive.
+    """
+
+    seed: int
+    success: float = 0.3
+    wanted: float = 0.5
+    events: list[Event] = field(default_factory=list)
+    actions: list[dict[str, float]] = field(default_factory=list)
+    holding: bool = False
+
+    def __post_init__(self) -> None:
+        self._successes, self._wishes = (np.random.default_rng([self.seed, which]) for which in (0, 1))
+        self.grasp_wanted = False
+
+    def drive(self, phase: Phase) -> None:
+        self.events.append(("drive", phase))
+        self.grasp_wanted = bool(self._wishes.random() < self.wanted)
+
+    def grasp(self, phase: Phase) -> bool:
+        self.events.append(("grasp", phase))
+        self.holding = bool(self._successes.random() < self.success)
+        return self.holding
+
+    def place(self, phase: Phase) -> None:
+        self.events.append(("place", phase))
+        self.holding = False
+
+    # --- As a robot -----------------------------------------------------------------------------------------
+    phase = Phase.LEARNING  # of the action to come
+
+    def get_observation(self) -> dict[str, Any]:
+        return {FRONT: np.full((2, 2, 3), 255 * self.grasp_wanted, np.uint8), "holding.pos": float(self.holding)}
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        self.actions.append(action)
+        skill = Skill(int(action["skill.pos"]))
+        {Skill.NAVIGATE: self.drive, Skill.GRASP: self.grasp, Skill.PLACE: self.place}[skill](self.phase)
+        return action
+
+
+class PhaseLife(Life):
+    """A life that tells the world the phase of each frame."""
+
+    def step(self, action: dict[str, float], phase: Phase, grasp_probability: float = -1.0) -> bool:
+        self._robot.phase = phase
+        return super().step(action, phase, grasp_probability)
+
+
+class FakePolicy:
+    """Its P[grasp] is what the picture says: 1 if it is white, `floor_probability` if black."""
+
+    sampling = False
+    rng = None
+    floor_probability = 0.0
+
+    def __init__(self, config: ReLMMConfig) -> None:
+        self.config = config
+        self.grasp_probability = -1.0
+        self.grasping = SimpleNamespace(sample=lambda estimate, rng: torch.tensor([SAMPLED_CELL]))
+
+    def to_pictures(self, image: np.ndarray) -> np.ndarray:
+        return image
+
+    def look(self, image: np.ndarray) -> None:
+        self.grasp_probability = 1.0 if image.max() else self.floor_probability
+
+    def navigate(self, image: np.ndarray) -> dict[str, float]:
+        return POLICY_DRIVE
+
+
+class FakeLearner:
+    """Notes when it is asked to learn."""
+
+    def __init__(self, world: World, min_attempts: int) -> None:
+        self._world, self._min_attempts = world, min_attempts
+        self.replay = SimpleNamespace(attempts=[])
+
+    @property
+    def grasping_has_begun(self) -> bool:
+        return len(self.replay.attempts) >= self._min_attempts
+
+    def update_grasping(self) -> None:
+        self._world.events.append(LEARN_GRASP)
+
+    def update_navigation(self) -> None:
+        self._world.events.append(LEARN_DRIVE)
+
+    # --- As a recorder --------------------------------------------------------------------------------------
+    def add_frame(self, observation: Any, action: dict[str, float], outcome: Any, task: str) -> None:
+        if action["skill.pos"] == Skill.GRASP:
+            self.replay.attempts.append(action)
+
+    def save_episode(self) -> None:
+        pass
+
+
+@dataclass
+class Run:
+    world: World
+    trainer: Trainer
+    progress: Progress
+    policy: FakePolicy
+
+
+MakeRun = Callable[..., Run]
+
+
+@pytest.fixture
+def make_run() -> MakeRun:
+    def make(
+        world: World,
+        curriculum: str = "none",
+        put_in_reach: Callable[[], bool] = lambda: False,
+        should_stop: Callable[[], bool] = lambda: False,
+        **settings: Any,
+    ) -> Run:
+        config = ReLMMConfig(**{"device": "cpu", "random_steps": 0, **settings})
+        progress, policy = Progress(), FakePolicy(config)
+        learner = FakeLearner(world, config.min_attempts_to_update)
+        life = PhaseLife(world, [learner, progress], lambda: 0.0, max_steps=10**6, should_stop=should_stop)
+        trainer = Trainer(
+            life, policy, learner, curriculum=curriculum, pseudo_reset_steps=PSEUDO_RESET_STEPS,
+            rng=np.random.default_rng(0), put_in_reach=put_in_reach, progress=progress,
+        )  # fmt: skip
+        return Run(world, trainer, progress, policy)
+
+    return make
+
+
+# --- The paper's algorithms ----------------------------------------------------------------------------------
+def train_grasp(world: World, n: int, st: bool, phase: Phase) -> bool:
+    """Algorithm 1."""
+    for _ in range(n):
+        r_g = world.grasp(phase)
+        world.events.append(LEARN_GRASP)
+        if st:
+            if world.holding:
+                world.place(Phase.CURRICULUM)
+        elif r_g:
+            return r_g
+    return False
+
+
+def train_grasp_auto_curr(world: World, config: ReLMMConfig) -> bool:
+    """Algorithm 3."""
+    attempts = sum(name == "grasp" for name, _ in world.events)
+    if attempts >= config.num_max:
+        return train_grasp(world, config.num_grasp, False, Phase.LEARNING)
+    n_since, r_max = 0, False
+    while True:
+        r_g = world.grasp(Phase.CURRICULUM)
+        attempts += 1
+        world.events.append(LEARN_GRASP)
+        n_since = 0 if r_g else n_since + 1
+        r_max = r_max or r_g
+        if attempts >= config.num_max:
+            break
+        if r_max:
+            if n_since >= config.num_stop:
+                break
+        elif n_since >= config.num_start:
+            break
+        if r_g:
+            world.place(Phase.CURRICULUM)
+    return r_max
+
+
+def pseudo_reset(world: World) -> None:
+    """Section 4.3: carry it elsewhere, put it down, turn and drive away."""
+    for _ in range(PSEUDO_RESET_STEPS):
+        world.drive(Phase.PSEUDO_RESET)
+    if world.holding:
+        world.place(Phase.PSEUDO_RESET)
+    for _ in range(4 + PSEUDO_RESET_STEPS):
+        world.drive(Phase.PSEUDO_RESET)
+
+
+def relmm_step(world: World, config: ReLMMConfig, autonomous: bool) -> None:
+    """The loop of Algorithms 2 and 4; P[grasp] is 1 while the curriculum lasts, and that of the picture after a_n."""
+    practising = autonomous and sum(name == "grasp" for name, _ in world.events) < config.num_max
+    world.drive(Phase.LEARNING)
+    r_g = False
+    if practising or world.grasp_wanted:
+        if autonomous:
+            r_g = train_grasp_auto_curr(world, config)
+        else:
+            r_g = train_grasp(world, config.num_grasp, False, Phase.LEARNING)
+    world.events.append(LEARN_DRIVE)
+    if r_g:
+        pseudo_reset(world)
+
+
+# --- Normal training -----------------------------------------------------------------------------------------
+@pytest.mark.parametrize("num_grasp", [1, 2, 5])
+@pytest.mark.parametrize("seed", range(5))
+def test_training_is_algorithm_2(num_grasp: int, seed: int, make_run: MakeRun) -> None:
+    run, paper = make_run(World(seed), num_grasp=num_grasp), World(seed)
+    for _ in range(60):
+        run.trainer.navigation_step()
+        relmm_step(paper, run.policy.config, autonomous=False)
+    assert run.world.events == paper.events
+    assert run.progress.steps == 60
+    assert run.policy.sampling, "it explores"
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("success", [0.05, 0.5])
+def test_training_with_the_autonomous_curriculum_is_algorithm_4(seed: int, success: float, make_run: MakeRun) -> None:
+    limits = {"num_start": 3, "num_stop": 6, "num_max": 50}
+    run, paper = make_run(World(seed, success), "autonomous", **limits), World(seed, success)
+    for _ in range(60):
+        run.trainer.navigation_step()
+        relmm_step(paper, run.policy.config, autonomous=True)
+    assert run.world.events == paper.events
+    assert run.progress.practice_attempts == 50
+
+
+def test_nobody_grasps_where_p_grasp_is_0(make_run: MakeRun) -> None:
+    run = make_run(World(0, wanted=0.0))
+    for _ in range(5):
+        run.trainer.navigation_step()
+    assert run.world.events == [DRIVE, LEARN_DRIVE] * 5
+
+
+def test_failed_attempts_stop_at_their_limit(make_run: MakeRun) -> None:
+    run = make_run(World(0, success=0.0, wanted=1.0), num_grasp=3)
+    run.trainer.navigation_step()
+    assert run.world.events == [DRIVE, *[GRASP, LEARN_GRASP] * 3, LEARN_DRIVE]
+
+
+def test_gate_grasps_in_proportion_to_its_probability(make_run: MakeRun) -> None:
+    run = make_run(World(0, success=0.0, wanted=0.0), num_grasp=1)
+    run.policy.floor_probability = 0.3
+    for _ in range(600):
+        run.trainer.navigation_step()
+    assert run.progress.attempts / 600 == pytest.approx(0.3, abs=4 * (0.21 / 600) ** 0.5)
+
+
+def test_first_steps_are_uniform_and_later_ones_the_policys(make_run: MakeRun) -> None:
+    run = make_run(World(0, wanted=0.0), random_steps=20)
+    for _ in range(25):
+        run.trainer.navigation_step()
+    assert [action == POLICY_DRIVE for action in run.world.actions] == [False] * 20 + [True] * 5
+    assert len({tuple(action.values()) for action in run.world.actions}) == 21
+
+
+def test_cells_are_uniform_until_the_ensemble_has_begun_to_learn(make_run: MakeRun) -> None:
+    run = make_run(World(0, success=0.0, wanted=1.0), num_grasp=2, min_attempts_to_update=10)
+    for _ in range(8):
+        run.trainer.navigation_step()
+    grasps = [action for action in run.world.actions if action["skill.pos"] == Skill.GRASP]
+    cells = [xy_to_cell(action["skill_x.pos"], action["skill_y.pos"]) for action in grasps]
+    assert cells[10:] == [SAMPLED_CELL] * 6
+    assert len(set(cells[:10])) > 5
+    assert all(0 <= cell < GRID**2 for cell in cells)
+
+
+@pytest.mark.parametrize(("curriculum", "learns"), [("none", False), ("autonomous", True)])
+def test_frozen_ensemble_learns_in_the_curriculum_only(curriculum: str, learns: bool, make_run: MakeRun) -> None:
+    run = make_run(World(0, success=0.0, wanted=1.0), curriculum, freeze_grasping=True, num_max=8)
+    for _ in range(3):
+        run.trainer.navigation_step()
+    assert (LEARN_GRASP in run.world.events) == learns
+    assert run.progress.attempts == 6
+
+
+# --- Stationary curriculum -----------------------------------------------------------------------------------
+@pytest.mark.parametrize("seed", range(6))
+def test_stationary_curriculum_is_algorithm_1(seed: int, make_run: MakeRun) -> None:
+    """What is held at its end is carried away instead of dropped."""
+    run, paper = make_run(World(seed), "stationary", num_stationary=25), World(seed)
+    while run.trainer.in_stationary_curriculum:
+        run.trainer.stationary_attempt()
+    train_grasp(paper, 25, True, Phase.CURRICULUM)
+    if paper.events[-1] == DROP:
+        paper.events.pop()
+        paper.holding = True
+        pseudo_reset(paper)
+    assert run.world.events == paper.events
+    assert run.progress.practice_attempts == 25
+
+
+def test_held_things_are_dropped_at_random_places_in_reach(make_run: MakeRun) -> None:
+    run = make_run(World(0, success=1.0), "stationary", num_stationary=20)
+    for _ in range(20):
+        run.trainer.stationary_attempt()
+    places = [
+        (action["skill_x.pos"], action["skill_y.pos"]) for action in run.world.actions if action["skill.pos"] == 2
+    ]
+    assert all(in_grasp_area(x, y) for x, y in places)
+    assert len(set(places)) == 20, "19 drops and the end of the curriculum"
+
+
+def test_interventions_are_counted_and_seen(make_run: MakeRun) -> None:
+    world, asked = World(0, success=0.0), []
+
+    def person() -> bool:
+        asked.append(world.holding)
+        world.grasp_wanted = len(asked) == 3
+        return world.grasp_wanted
+
+    run, seen = make_run(world, "stationary", put_in_reach=person), []
+    for _ in range(3):
+        run.trainer.stationary_attempt()
+        seen.append(run.policy.grasp_probability)
+    assert run.progress.interventions == 1
+    assert seen == [0.0, 0.0, 1.0], "the attempt looks at what the person has done"
+    assert asked == [False] * 3
+
+
+def test_no_curriculum_is_stationary_by_itself(make_run: MakeRun) -> None:
+    for curriculum in ("none", "autonomous"):
+        assert not make_run(World(0), curriculum).trainer.in_stationary_curriculum
+
+
+# --- Stopping ------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("frames", [1, 3, 30])
+def test_practice_stops_when_told(frames: int, make_run: MakeRun) -> None:
+    world = World(1, success=0.5)
+    run = make_run(world, "autonomous", should_stop=lambda: len(world.actions) >= frames, num_stop=1000, num_start=1000)
+    run.trainer.navigation_step()
+    assert len(world.actions) <= frames + 1, "at most the first frame of a pseudo-reset follows"
+
+
+def test_pseudo_reset_stops_when_told(make_run: MakeRun) -> None:
+    world = World(0, success=1.0, wanted=1.0)
+    run = make_run(world, should_stop=lambda: len(world.actions) >= 4)
+    run.trainer.navigation_step()
+    assert len(world.actions) == 4

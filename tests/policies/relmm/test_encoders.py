@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from relmm.features import GRASP_X, GRASP_Y, GRID
+from relmm.geometry import camera_geometry
+from relmm.policies.relmm.configuration_relmm import NAVIGATION_ENCODERS
+from relmm.policies.relmm.encoders import Encoder, FloorObserver, PictureObserver, make_observer
+from relmm.policies.relmm.floor import OBJECT_HEIGHT
+from relmm.policies.relmm.grasping import GraspEnsemble
+
+REACH = (slice(1, 4), slice(15, 18))  # pixels of the map that the grasp cells make up
+PIXEL = 5  # cells a side
+
+
+@pytest.fixture
+def ensemble(make_config) -> GraspEnsemble:
+    torch.manual_seed(0)
+    return GraspEnsemble(make_config())
+
+
+@pytest.fixture
+def observer(make_config) -> FloorObserver:
+    return FloorObserver(make_config())
+
+
+def to_images(picture: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
+
+
+# --- The map -------------------------------------------------------------------------------------------------
+def test_map_agrees_with_the_grasp_cells_where_the_arm_reaches(observer, ensemble, noise_pictures) -> None:
+    """The map is drawn by the first member; a pixel shows the best of its 5x5 cells."""
+    images = noise_pictures(2)
+    cells = ensemble.logits(images)[0].sigmoid().reshape(2, GRID // PIXEL, PIXEL, GRID // PIXEL, PIXEL)
+    drawn = observer(images, ensemble)[:, 0][:, *REACH]
+    assert (drawn.float() - cells.amax(dim=(2, 4)) * 255).abs().max() <= 1
+
+
+def test_map_shows_the_mean_colours_of_the_floor(observer, ensemble, noise_pictures) -> None:
+    images = noise_pictures(2)
+    floor = ensemble.backbone.view(images)[:, :, 4:-4, 4:-4]
+    colours = functional.avg_pool2d((floor + 1) / 2, PIXEL) * 255
+    assert (observer(images, ensemble)[:, 1:][:, :, *REACH].float() - colours).abs().max() <= 1
+
+
+@pytest.mark.parametrize("camera", ["paper", "d435"])
+@pytest.mark.parametrize(("x", "y"), [(0.35, 0.05), (0.5, 0.2), (0.7, -0.25), (0.9, 0.0)])
+def test_thing_beyond_reach_is_judged_where_it_lies(x, y, camera, make_config, see_green, draw) -> None:
+    config = make_config(camera=camera)
+    ensemble = GraspEnsemble(config)
+    see_green(ensemble, [30.0] * 3)
+    picture = draw(camera=camera)
+    column, row = camera_geometry(camera).project(np.array([x, y, OBJECT_HEIGHT])).round().astype(int)
+    picture[row - 1 : row + 2, column - 1 : column + 2] = (0, 255, 0)
+    graspable = FloorObserver(config)(to_images(picture), ensemble)[0, 0].float()
+    rows, columns = torch.nonzero(graspable > 128, as_tuple=True)
+    cell = (GRASP_X[1] - GRASP_X[0]) / GRID, (GRASP_Y[1] - GRASP_Y[0]) / GRID
+    true_row = ((x - GRASP_X[0]) / cell[0] + PIXEL) / PIXEL - 0.5
+    true_column = ((y - GRASP_Y[0]) / cell[1] + 75) / PIXEL - 0.5
+    assert rows.float().mean().item() == pytest.approx(true_row, abs=1.0)
+    assert columns.float().mean().item() == pytest.approx(true_column, abs=1.0)
+
+
+def test_mirrored_floor_gives_a_mirrored_map(observer, ensemble, see_green, noise_pictures) -> None:
+    """The paper's camera looks straight ahead, so left and right of the map may be exchanged."""
+    see_green(ensemble, [3.0] * 3)
+    images = noise_pictures(1)
+    seen, mirrored = observer(images, ensemble), observer(images.flip(-1), ensemble).flip(-1)
+    assert (seen.int() - mirrored.int()).abs().max() <= 1
+
+
+@pytest.mark.parametrize("camera", ["paper", "d435"])
+def test_nothing_is_graspable_out_of_view_or_farther_off_than_is_judged(camera, make_config) -> None:
+    config = make_config(camera=camera, grasp_initial_logit=5.0, grasp_initial_spread=0.0)
+    observer = FloorObserver(config)
+    graspable = observer(torch.zeros(1, 3, 100, 100), GraspEnsemble(config))[0, 0]
+    visible = functional.max_pool2d((observer.view.grid.abs() <= 1).all(-1)[4:-4, 4:-4].float()[None], PIXEL)[0]
+    visible[20:] = 0
+    assert torch.equal(graspable > 0, visible > 0)
+    assert 0 < (graspable > 0).float().mean() < 1
+
+
+def test_map_follows_what_the_ensemble_learns(observer, ensemble, see_green, draw) -> None:
+    images = to_images(draw(112))
+    see_green(ensemble, [0.0] * 3)
+    assert observer(images, ensemble)[0, 0, 2, 16] < 10
+    see_green(ensemble, [30.0] * 3)
+    assert observer(images, ensemble)[0, 0, 2, 16] > 245
+
+
+# --- Observers and encoders ----------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", NAVIGATION_ENCODERS)
+def test_observation_and_features_have_the_promised_shapes(kind: str, make_config, noise_pictures) -> None:
+    config = make_config("rectified" if kind == "floor" else "dense", navigation_encoder=kind)
+    observer = make_observer(config)
+    observations = observer(noise_pictures(2), GraspEnsemble(config))
+    assert isinstance(observer, FloorObserver if kind == "floor" else PictureObserver)
+    assert observations.dtype == torch.uint8
+    assert observations.shape == (2, *observer.shape)
+    encoder = Encoder(kind)
+    assert encoder(observations).shape == (2, encoder.features)
+
+
+def test_paper_encoder_is_that_of_the_authors() -> None:
+    encoder = Encoder("paper")
+    assert encoder.features == 9216
+    assert sum(weight.numel() for weight in encoder.parameters()) == 75_648
+
+
+def test_picture_observer_gives_back_the_stored_picture(ensemble) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8)
+    assert torch.equal(PictureObserver()(to_images(picture), ensemble)[0].permute(1, 2, 0), torch.from_numpy(picture))
+
+
+def test_encoder_scales_its_input_to_plus_and_minus_1() -> None:
+    encoder = Encoder("floor")
+    seen: list[torch.Tensor] = []
+    encoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    encoder(torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 4, 32, 33))
+    assert [float(values.min()) for values in seen[0]] == [float(values.max()) for values in seen[0]] == [-1.0, 1.0]

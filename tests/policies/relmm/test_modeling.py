@@ -1,0 +1,381 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
+from numpy.typing import NDArray
+from torch import Tensor
+
+import relmm.plugin  # noqa: F401
+from relmm.features import (
+    ACTION_NAMES,
+    BASKET_XY,
+    GRID,
+    IMAGE_KEY,
+    MAX_THETA_VEL,
+    MAX_X_VEL,
+    Skill,
+    action_dict,
+    cell_to_xy,
+    xy_to_cell,
+)
+from relmm.policies.controller import grasp_cell
+from relmm.policies.relmm.modeling_relmm import ReLMMPolicy, from_navigation_steps, to_navigation_step
+from relmm.policies.relmm.navigation import NavigationBatch
+from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
+
+CELLS = GRID**2
+BACKBONES = ["rectified", "dense"]
+MakePolicy = Callable[..., ReLMMPolicy]
+
+
+@pytest.fixture
+def make_policy_of(make_config) -> MakePolicy:
+    return lambda *backbone, **settings: ReLMMPolicy(make_config(*backbone, **settings)).eval()
+
+
+@pytest.fixture
+def certain(make_policy_of: MakePolicy, set_logits) -> MakePolicy:
+    """A policy that expects success with a known probability in cell 7 and with 1 % elsewhere."""
+
+    def make(probability: float, **settings: Any) -> ReLMMPolicy:
+        policy = make_policy_of("dense", **settings)
+        logits = torch.full((3, CELLS), math.log(0.01 / 0.99))
+        logits[:, 7] = math.log(probability / (1 - probability))
+        set_logits(policy.grasping, logits)
+        return policy
+
+    return make
+
+
+@pytest.fixture
+def green(make_policy_of: MakePolicy, see_green) -> ReLMMPolicy:
+    """A policy that wants to grasp what is green."""
+    policy = make_policy_of(seed=3)
+    see_green(policy.grasping, [15.0, 20.0, 25.0])
+    return policy
+
+
+def skills(policy: ReLMMPolicy, batch: dict[str, Tensor], steps: int) -> list[int]:
+    return [int(policy.select_action(batch)[0, 2]) for _ in range(steps)]
+
+
+def same_weights(first: torch.nn.Module, second: torch.nn.Module) -> bool:
+    pairs = zip(first.state_dict().items(), second.state_dict().items(), strict=True)
+    return all(a == b and torch.equal(x, y) for (a, x), (b, y) in pairs)
+
+
+# --- Deciding ------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("probability", "skill"), [(0.49, Skill.NAVIGATE), (0.51, Skill.GRASP)])
+def test_greedy_policy_grasps_where_it_expects_success_in_half_the_cases(
+    probability: float, skill: Skill, certain: MakePolicy, act, empty
+) -> None:
+    action = act(certain(probability), empty)
+    assert action["skill.pos"] == skill
+    if skill == Skill.GRASP:
+        assert (action["skill_x.pos"], action["skill_y.pos"]) == pytest.approx(tuple(cell_to_xy(7)))
+
+
+def test_greedy_policy_is_not_moved_by_uncertainty(make_policy_of: MakePolicy, set_logits, act, empty) -> None:
+    """The mean decides, as the paper's evaluation does: neither the gate nor the cell gets the bonus."""
+    policy = make_policy_of("dense")
+    logits = torch.full((3, CELLS), -4.0)
+    logits[:, 50] = 0.5  # mean 0.62, no deviation
+    logits[:, 90] = torch.tensor([20.0, -20.0, 0.0])  # mean 0.5, deviation 0.41
+    set_logits(policy.grasping, logits)
+    action = act(policy, empty)
+    assert xy_to_cell(action["skill_x.pos"], action["skill_y.pos"]) == 50
+    logits[:, 50] = -0.2  # mean 0.45
+    logits[:, 90] = torch.tensor([20.0, -20.0, -1.0])  # mean 0.42, deviation 0.42: P[grasp] is 0.84
+    set_logits(policy.grasping, logits)
+    assert act(policy, empty)["skill.pos"] == Skill.NAVIGATE
+    assert policy.grasp_probability > 0.8
+
+
+def test_greedy_policy_grasps_the_thing_it_sees(green: ReLMMPolicy, act, draw) -> None:
+    for cell in (20, 112, 200):
+        green.reset()
+        action = act(green, draw(cell))
+        found = np.array([action["skill_x.pos"], action["skill_y.pos"]]) - cell_to_xy(cell)
+        assert action["skill.pos"] == Skill.GRASP
+        assert np.abs(found).max() < 0.012
+
+
+@pytest.mark.parametrize("num_grasp", [1, 2, 4])
+@pytest.mark.parametrize("sample", [False, True])
+def test_drives_after_so_many_attempts(num_grasp: int, sample: bool, certain: MakePolicy, make_batch, empty) -> None:
+    policy = certain(0.999999, num_grasp=num_grasp, sample=sample)
+    turn = [Skill.GRASP] * num_grasp + [Skill.NAVIGATE]
+    assert skills(policy, make_batch(empty), 2 * len(turn)) == turn * 2
+
+
+def test_what_is_held_goes_into_the_basket(certain: MakePolicy, make_batch, empty) -> None:
+    actions = certain(0.9).select_action(make_batch(empty, empty, holding=(1,)))
+    assert actions[0, 2] == Skill.GRASP
+    assert actions[1].tolist() == pytest.approx([0, 0, Skill.PLACE, *BASKET_XY])
+
+
+def test_greedy_rows_of_a_batch_decide_as_alone(green: ReLMMPolicy, make_batch, draw, empty) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8)
+    images = [empty, draw(112), noise, draw(30, 200)]
+    together = torch.stack([green.select_action(make_batch(*images)) for _ in range(4)])
+    for index, image in enumerate(images):
+        green.reset()
+        alone = torch.stack([green.select_action(make_batch(image)) for _ in range(4)])[:, 0]
+        assert torch.allclose(alone, together[:, index], atol=1e-5)
+    assert set(together[..., 2].flatten().tolist()) == {Skill.NAVIGATE, Skill.GRASP}
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_greedy_policy_is_deterministic(backbone: str, make_policy_of: MakePolicy, make_batch, empty) -> None:
+    first, second = (make_policy_of(backbone, seed=seed_of_both) for seed_of_both in (2, 2))
+    batch = make_batch(empty)
+    torch.manual_seed(5)
+    actions = first.select_action(batch)
+    torch.manual_seed(6)
+    first.reset()
+    assert torch.equal(first.select_action(batch), actions)
+    assert torch.equal(second.select_action(batch), actions)
+
+
+@pytest.mark.parametrize("probability", [0.2, 0.7])
+def test_sampling_policy_grasps_with_its_probability(probability: float, certain: MakePolicy, make_batch, empty):
+    policy, batch, count = certain(probability, sample=True, num_grasp=1), make_batch(empty), 400
+    grasps = 0
+    for _ in range(count):
+        policy.reset()
+        grasps += skills(policy, batch, 1)[0] == Skill.GRASP
+    assert policy.grasp_probability == pytest.approx(probability, abs=1e-4)
+    assert grasps / count == pytest.approx(probability, abs=4 * math.sqrt(probability * (1 - probability) / count))
+
+
+def test_once_decided_a_sampling_policy_attempts_again(certain: MakePolicy, make_batch, empty) -> None:
+    """Algorithm 1: the gate is asked once, not before each of the N_grasp attempts."""
+    taken = skills(certain(0.3, sample=True, num_grasp=3), make_batch(empty), 300)
+    runs = "".join(map(str, taken)).strip("1").split("0")
+    assert set(runs) == {"", "111"}
+
+
+@pytest.mark.xfail(strict=True, reason="attempts are still counted after a success, so the gate is not asked again")
+def test_success_ends_the_attempts_of_a_step(certain: MakePolicy, make_batch, set_logits, empty) -> None:
+    """Algorithm 1 returns with the first success."""
+    policy = certain(0.999999, sample=True, num_grasp=3)
+    taken = [int(policy.select_action(make_batch(empty, holding=held))[0, 2]) for held in ((), (0,))]
+    assert taken == [Skill.GRASP, Skill.PLACE]
+    set_logits(policy.grasping, torch.full((3, CELLS), -20.0))
+    assert skills(policy, make_batch(empty), 1) == [Skill.NAVIGATE]
+
+
+def test_sampling_policy_explores_cells_and_drives(certain: MakePolicy, make_batch, empty) -> None:
+    policy, batch = certain(0.5, sample=True), make_batch(empty)
+    actions = torch.stack([policy.select_action(batch)[0] for _ in range(150)])
+    grasps, drives = actions[actions[:, 2] == Skill.GRASP], actions[actions[:, 2] == Skill.NAVIGATE]
+    assert len({tuple(place) for place in grasps[:, 3:].tolist()}) > 10
+    assert len({tuple(drive) for drive in drives[:, :2].tolist()}) == len(drives)
+
+
+@pytest.mark.xfail(strict=True, reason="all rows of a batch and all episodes draw from one stream")
+def test_sampling_rows_of_a_batch_draw_their_own_streams(certain: MakePolicy, make_batch, empty) -> None:
+    """As `ControllerConfig` says of `seed`."""
+    policy = certain(0.5, sample=True)
+    together = torch.stack([policy.select_action(make_batch(empty, empty)) for _ in range(5)])
+    alone = certain(0.5, sample=True)
+    assert torch.equal(torch.stack([alone.select_action(make_batch(empty))[0] for _ in range(5)]), together[:, 0])
+
+
+def test_probability_is_unknown_before_the_first_picture(certain: MakePolicy) -> None:
+    assert certain(0.5).grasp_probability == -1.0
+
+
+# --- Actions -------------------------------------------------------------------------------------------------
+def test_navigation_actions_convert_there_and_back() -> None:
+    actions = torch.tensor([[-1.0, -1.0], [-1.0, 0.0], [0.0, 0.5], [1.0, 1.0], [0.3, -0.7]])
+    steps = [list(to_navigation_step(action).values()) for action in actions.tolist()]
+    assert torch.allclose(from_navigation_steps(torch.tensor(steps)), actions, atol=1e-6)
+    assert steps[1] == [0.0, 0.0, Skill.NAVIGATE, 0.0, 0.0], "-1 forward stands still"
+    assert steps[3][:2] == [MAX_X_VEL, MAX_THETA_VEL], "positive turns left"
+
+
+def test_navigation_steps_beyond_the_range_are_clipped() -> None:
+    """A robot that bumped drives backwards."""
+    steps = torch.tensor([[-0.2, 200.0, 0, 0, 0], [0.9, -200.0, 0, 0, 0]])
+    assert from_navigation_steps(steps).tolist() == [[-1.0, 1.0], [1.0, -1.0]]
+
+
+# --- Seeds, files and LeRobot --------------------------------------------------------------------------------
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_equal_seeds_give_equal_weights_and_leave_global_random_numbers_alone(backbone, make_policy_of) -> None:
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    first = make_policy_of(backbone, seed=4)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(2)
+    assert same_weights(first, make_policy_of(backbone, seed=4))
+    assert not same_weights(first, make_policy_of(backbone, seed=5))
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+@pytest.mark.parametrize("sample", [False, True])
+def test_saved_and_loaded_it_acts_the_same(backbone, sample, make_policy_of, make_batch, empty, tmp_path: Path) -> None:
+    policy = make_policy_of(backbone, seed=6, sample=sample, grasp_threshold=0.3)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight += 0.01
+    policy.save_pretrained(tmp_path)
+    loaded = ReLMMPolicy.from_pretrained(tmp_path)
+    batch = make_batch(empty)
+    assert loaded.config == policy.config
+    assert same_weights(loaded, policy)
+    assert all(torch.equal(policy.select_action(batch), loaded.select_action(batch)) for _ in range(8))
+
+
+def test_lerobot_makes_it_for_the_room(make_batch, empty) -> None:
+    config = PreTrainedConfig.get_choice_class("relmm")(device="cpu", grasp_channels=4, navigation_hidden=8)
+    policy = make_policy(config, env_cfg=RelmmRoomEnvConfig())
+    assert type(policy) is get_policy_class("relmm") is ReLMMPolicy
+    before, after = make_pre_post_processors(config)
+    action = after(policy.select_action(before(make_batch(empty))))
+    assert action.shape == (1, len(ACTION_NAMES))
+
+
+def test_optimiser_gets_every_weight_but_the_targets_once(make_policy_of: MakePolicy) -> None:
+    policy = make_policy_of(grasp_learning_rate=0.01, navigation_learning_rate=0.02)
+    groups = policy.get_optim_params()
+    given = [weight for group in groups for weight in group["params"]]
+    targets = list(policy.navigation.targets.parameters())
+    assert (
+        len({id(weight) for weight in [*given, *targets]}) == len(given) + len(targets) == len([*policy.parameters()])
+    )
+    assert [group["lr"] for group in groups] == [0.01, 0.02]
+
+
+# --- Relabelling ---------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("relabel", "terminal", "rewards", "continues"),
+    [
+        (True, True, [-0.7, -1.0, 0.0], [0.7, 1.0, 0.0]),
+        (True, False, [-0.7, -1.0, 0.0], [1.0, 1.0, 0.0]),
+        (False, True, [-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]),
+    ],
+)
+def test_steps_without_success_are_rewarded_with_the_grasp_probability(
+    relabel: bool, terminal: bool, rewards: list[float], continues: list[float], make_policy_of: MakePolicy
+) -> None:
+    policy = make_policy_of("dense", relabel=relabel, relabel_terminal=terminal)
+    pictures = torch.zeros(3, 1, 1, 1, dtype=torch.uint8)
+    success = torch.tensor([0.0, 0.0, 1.0])
+    batch = NavigationBatch(pictures, torch.zeros(3, 2), success - 1, pictures, 1 - success)
+    result = policy.relabel(batch, torch.tensor([0.3, 0.0, 0.9]), success < 0.5)
+    assert result.rewards.tolist() == pytest.approx(rewards)
+    assert result.continues.tolist() == pytest.approx(continues)
+    assert batch.rewards.tolist() == [-1, -1, 0], "what was given is left as it is"
+
+
+# --- Learning from LeRobot's batches -------------------------------------------------------------------------
+LAST_NOT_FIRST = pytest.mark.xfail(
+    strict=True, reason="at the episode's end forward takes the last attempt's picture, the replay the first's"
+)
+TOO_SHORT = pytest.mark.xfail(
+    strict=True, reason="forward sees num_grasp + 1 frames after a drive, but the attempts of a curriculum go on"
+)
+Frame = tuple[NDArray[np.uint8], dict[str, float], float]
+DRIVE = action_dict(x_vel=0.3, theta_vel=-40.0)
+
+
+def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> dict[str, Tensor]:
+    """What LeRobot's dataset gives for some frames: beyond the episode's end, its last frame again."""
+    wanted = [[frame + delta for delta in policy.config.observation_delta_indices] for frame in frames]
+    rows = [[episode[min(index, len(episode) - 1)] for index in row] for row in wanted]
+    return {
+        IMAGE_KEY: torch.from_numpy(np.stack([[f[0] for f in row] for row in rows])).permute(0, 1, 4, 2, 3) / 255,
+        "action": torch.tensor([[[f[1][name] for name in ACTION_NAMES] for f in row] for row in rows]),
+        "next.reward": torch.tensor([[f[2] for f in row] for row in rows]),
+        f"{IMAGE_KEY}_is_pad": torch.tensor([[index >= len(episode) for index in row] for row in wanted]),
+    }
+
+
+def make_episode(draw, *outcomes: str) -> list[Frame]:
+    """An episode of drives (d), failed attempts (f), successes (s) and placements (p), each with its own picture."""
+    actions = {"d": DRIVE, "f": grasp_cell(40), "s": grasp_cell(112), "p": action_dict(Skill.PLACE)}
+    return [
+        (draw(100 + index, color=(0, 18 + 5 * index, 0)), actions[outcome], float(outcome == "s"))
+        for index, outcome in enumerate(outcomes)
+    ]
+
+
+def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, success: bool) -> NavigationBatch:
+    """The transition of the drive in frame 0."""
+    pictures = torch.cat([policy.to_pictures(episode[frame][0]) for frame in (0, after)])
+    chance = 0.0 if success else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
+    observations = policy.observer(pictures, policy.grasping)
+    return NavigationBatch(
+        observations[:1],
+        from_navigation_steps(torch.tensor([list(DRIVE.values())])),
+        torch.tensor([0.0 if success else chance - 1]),
+        observations[1:],
+        torch.tensor([0.0 if success else 1 - chance]),
+    )
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "after", "success"),
+    [
+        ("dd", 1, False),
+        ("dfd", 2, False),
+        ("dffd", 3, False),
+        ("dpd", 1, False),
+        ("ddfs", 1, False),
+        ("ds", 1, True),
+        ("dfs", 2, True),
+        ("df", 1, False),
+        pytest.param("dff", 1, False, marks=LAST_NOT_FIRST),
+        pytest.param("dfffd", 4, False, marks=TOO_SHORT),
+        pytest.param("dfffs", 4, True, marks=TOO_SHORT),
+    ],
+)
+def test_forward_learns_a_drive_as_the_replay_knows_it(outcomes, after, success, green: ReLMMPolicy, draw) -> None:
+    episode = make_episode(draw, *outcomes)
+    torch.manual_seed(7)
+    loss, logs = green.forward(as_batch(green, episode, [0]))
+    torch.manual_seed(7)
+    expected, wanted = green.navigation.loss(expected_batch(green, episode, after, success), torch.randn(2, 1, 2))
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-4)
+    assert logs == pytest.approx(wanted, rel=1e-4)
+
+
+def test_forward_skips_a_drive_without_a_picture_after_it(green: ReLMMPolicy, draw) -> None:
+    loss, logs = green.forward(as_batch(green, make_episode(draw, "d"), [0]))
+    assert loss.item() == 0.0
+    assert logs == {}
+    loss.backward()
+
+
+def test_forward_learns_attempts_with_the_loss_of_the_ensemble(green: ReLMMPolicy, draw) -> None:
+    episode = make_episode(draw, *"dffsp")
+    loss, logs = green.forward(as_batch(green, episode, [1, 3, 4]))
+    pictures = torch.cat([green.to_pictures(episode[frame][0]) for frame in (1, 3)])
+    expected = green.grasping.loss(pictures, torch.tensor([40, 112]), torch.tensor([0.0, 1.0])).item()
+    assert loss.item() == pytest.approx(expected)
+    assert logs == {"grasp_loss": pytest.approx(expected)}
+
+
+def test_forward_adds_both_losses_and_update_moves_the_targets(make_policy_of: MakePolicy, draw) -> None:
+    policy, episode = make_policy_of(seed=1), make_episode(draw, *"dfdfs")
+    batch = as_batch(policy, episode, range(5))
+    loss, logs = policy.forward(batch)
+    parts = logs["grasp_loss"] + logs["critic_loss"] + logs["actor_loss"]
+    entropy_gap = -logs["entropy"] + policy.config.target_entropy
+    assert loss.item() == pytest.approx(parts - logs["temperature"] * entropy_gap, rel=1e-4)
+    loss.backward()
+    torch.optim.Adam(policy.get_optim_params()).step()
+    target = next(policy.navigation.targets.parameters())
+    before = target.clone()
+    policy.update()
+    assert not torch.equal(target, before)
