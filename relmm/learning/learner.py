@@ -93,7 +93,7 @@ class Learner:
         columns = (episode.images, episode.states[:, :2], episode.actions, episode.rewards, episode.phases)
         for picture, motion, action, reward, phase in zip(*columns, strict=True):
             attempts, steps = len(self.replay.attempts), self.replay.navigation_steps
-            self.replay.add(picture, motion, action, bool(reward > 0), int(phase))
+            self.replay.add(picture, (float(motion[0]), float(motion[1])), action, bool(reward > 0), int(phase))
             if update and len(self.replay.attempts) > attempts:
                 self.update_grasping()
             if update and self.replay.navigation_steps > steps:
@@ -126,17 +126,17 @@ class Learner:
         """Rows of navigation steps as a batch, relabelled by the current ensemble."""
         device, count = self.policy.weights_device, len(steps["frame"])
         frames = np.concatenate([steps["frame"], steps["next"]])
-        motions = torch.from_numpy(self.replay.motions(frames)).to(device)
+        trails = torch.from_numpy(self.replay.trails(frames)).to(device)
         observations, probabilities = self.maps.get(frames, self.config.refreshed_maps)
         success = torch.from_numpy(steps["success"]).to(device)
         actions = np.stack([steps["forward"], steps["turn"]], axis=1)
         batch = NavigationBatch(
             observations[:count],
-            motions[:count],
+            trails[:count],
             torch.from_numpy(actions).to(device),
             success.float() - 1,
             observations[count:],
-            motions[count:],
+            trails[count:],
             1 - success.float(),
         )
         return self.policy.relabel(batch, probabilities[count:], ~success)

@@ -58,6 +58,7 @@ class Life:
     Attributes:
         observation: the robot's last.
         episode: what has happened in the running episode.
+        succeeded: whether the last step picked something up.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class Life:
         self._grasps_in_a_row = 0
         self.observation: dict[str, Any] = robot.get_observation()
         self.episode = EpisodeResult()
+        self.succeeded = False
 
     @property
     def holding(self) -> bool:
@@ -99,7 +101,7 @@ class Life:
         self.observation = self._robot.get_observation()
         grasped = done_action["skill.pos"] == Skill.GRASP
         self._count(grasped, phase)
-        success = grasped and self.holding
+        success = self.succeeded = grasped and self.holding
         truncated = not success and (self.episode.steps >= self._max_steps or self.should_stop())
         outcome = {
             "next.reward": float(success),

@@ -21,6 +21,7 @@ from relmm.features import (
     Skill,
     xy_to_cell,
 )
+from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
 
 
 class Table:
@@ -77,7 +78,8 @@ class Replay:
         columns = {"frame": np.int64, "next": np.int64, "forward": np.float32, "turn": np.float32, "success": bool}
         self.steps, self.pseudo_reset_steps = Table(**columns), Table(**columns)
         self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)  # no memory until written to
-        self._motions = np.zeros((capacity, 2), np.float32)
+        self._trails = np.zeros((capacity, TRAIL_FEATURES), np.float32)
+        self._trail, self._drove = Trail(), False
         self._open_step: dict[str, float] | None = None  # the last navigation step, until it is known where it led
         self._open_table = self.steps  # that it belongs to
         self._first_attempt: int | None = None  # frame of the first attempt since then
@@ -92,19 +94,22 @@ class Replay:
         phase = int(outcome["complementary_info.phase"])
         self.add(observation[FRONT], motion, values, outcome["next.reward"] > 0, phase)
 
-    def add(self, picture: NDArray[np.uint8], motion: Any, action: Any, success: bool, phase: int) -> None:
+    def add(
+        self, picture: NDArray[np.uint8], motion: tuple[float, float], action: Any, success: bool, phase: int
+    ) -> None:
         """Take one frame.
 
         Args:
             picture: (100, 100, 3).
-            motion: how the robot had moved just before, m/s and deg/s.
+            motion: velocities of `observation.state`, m/s and deg/s.
             action: by `relmm.features.ACTION_NAMES`, length 5.
             success: whether this frame's attempt picked something up.
             phase: a `relmm.features.Phase`.
         """
         frame, self.frames = self.frames, self.frames + 1
         self._pictures[frame % self.capacity] = picture
-        self._motions[frame % self.capacity] = _scaled(*motion)
+        self._trail, self._drove = self._trail_here(motion), False
+        self._trails[frame % self.capacity] = self._trail.features()
         x_vel, theta_vel, skill, x, y = (float(value) for value in action)
         if round(skill) == Skill.GRASP:
             self.attempts.append(frame=frame, cell=xy_to_cell(x, y), success=success)
@@ -116,7 +121,8 @@ class Replay:
         self._close_step(frame)
         self.navigation_steps += phase == Phase.LEARNING
         if round(skill) == Skill.NAVIGATE:
-            forward, turn = _scaled(x_vel, theta_vel)
+            self._drove = True
+            forward, turn = x_vel / MAX_X_VEL * 2 - 1, theta_vel / MAX_THETA_VEL
             self._open_step = {"frame": frame, "forward": forward, "turn": turn}
             self._open_table = self.pseudo_reset_steps if phase == Phase.PSEUDO_RESET else self.steps
 
@@ -125,6 +131,7 @@ class Replay:
         if self._first_attempt is not None:
             self._close_step(self._first_attempt)
         self._open_step = self._first_attempt = None
+        self._trail, self._drove = Trail(), False
         self.episodes += 1
 
     def _close_step(self, following: int, success: bool = False) -> None:
@@ -137,16 +144,21 @@ class Replay:
         """The pictures of frames, uint8 (n, 100, 100, 3)."""
         return self._pictures[frames % self.capacity]
 
-    def motions(self, frames: NDArray[np.int64]) -> NDArray[np.float32]:
-        """How the robot had moved just before, forward and turn, about -1..1, (n, 2)."""
-        return self._motions[frames % self.capacity]
+    def trails(self, frames: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Where the robot had just been, `Trail.features`, (n, 15)."""
+        return self._trails[frames % self.capacity]
+
+    def next_trail(self, motion: tuple[float, float]) -> NDArray[np.float32]:
+        """The trail of a frame that would come next, for an observation with this motion, (15,)."""
+        return self._trail_here(motion).features()
+
+    def _trail_here(self, motion: tuple[float, float]) -> Trail:
+        trail = self._trail.copy()
+        if self._drove:
+            trail.moved(*motion)
+        return trail
 
     def sample(self, table: Table, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Rows of one of the tables whose pictures are still there, uniformly, with replacement, (count,)."""
         first = int(np.searchsorted(table["frame"], self.frames - self.capacity))
         return rng.integers(first, len(table), count)
-
-
-def _scaled(x_vel: float, theta_vel: float) -> tuple[float, float]:
-    """Forward and turn as the navigation policy counts them, -1..1."""
-    return x_vel / MAX_X_VEL * 2 - 1, theta_vel / MAX_THETA_VEL

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from relmm.features import FRONT, GRID, STATE_NAMES, Phase, Skill, action_dict
+from relmm.features import FRONT, GRID, Phase, Skill, action_dict
 from relmm.learning.curriculum import AutonomousCurriculum, Practice
 from relmm.learning.learner import Learner
 from relmm.learning.life import Life
@@ -65,9 +65,9 @@ class Trainer:
 
     def stationary_attempt(self) -> None:
         """One turn of TrainGrasp(N_st, True): drop what is held, attempt, learn."""
-        if self.life.holding:
-            self._drop()
-        if not self.life.holding and self._put_in_reach():
+        if self.life.holding and not self._drop():
+            return  # another place, the next time
+        if self._put_in_reach():
             self.progress.interventions += 1
             self.life.look_again()
         self._attempt(Phase.CURRICULUM)
@@ -77,6 +77,8 @@ class Trainer:
     # --- Algorithms 2 and 4 -------------------------------------------------------------------------------
     def navigation_step(self) -> None:
         """One turn of the loop: navigate, perhaps grasp, learn, and a pseudo-reset after a success."""
+        if self.life.holding:  # what could not be put down
+            self._pseudo_reset()
         self.life.step(self._navigation_action(), Phase.LEARNING, self._known_probability())
         practising = self._practising
         estimate = self._look()
@@ -91,8 +93,8 @@ class Trainer:
         practice = self._autonomous.session() if practising else Practice(self.config.num_grasp)
         phase = Phase.CURRICULUM if practising else Phase.LEARNING
         while not practice.finished and not self.life.should_stop():
-            if self.life.holding:
-                self._drop()
+            if self.life.holding and not self._drop():
+                break
             practice.attempted(self._attempt(phase))
             if practising and not self._practising:
                 break
@@ -102,7 +104,7 @@ class Trainer:
         """Look, choose a cell, grasp, learn; whether something was picked up."""
         estimate = self._look()
         self.life.step(grasp_cell(self._choose_cell(estimate)), phase, self.policy.grasp_probability)
-        success = self.life.holding
+        success = self.life.succeeded
         if phase == Phase.CURRICULUM or not self.config.freeze_grasping:
             self.learner.update_grasping()
         return success
@@ -117,16 +119,17 @@ class Trainer:
             return int(self._rng.integers(GRID**2))
         return int(self.policy.grasping.sample(estimate, self.policy.rng)[0])
 
-    def _drop(self) -> None:
-        """Put the held object down at a random place of the grasp area."""
+    def _drop(self) -> bool:
+        """Put the held object down at a random place of the grasp area; false if something was in the way."""
         x, y = self._rng.uniform((_DROP_X[0], _DROP_Y[0]), (_DROP_X[1], _DROP_Y[1]))
         self.life.step(action_dict(Skill.PLACE, x=float(x), y=float(y)), Phase.CURRICULUM)
+        return not self.life.holding
 
     def _navigation_action(self) -> dict[str, float]:
         if self.progress.steps < self.config.random_steps:
             return drive_anywhere(self._rng)
-        state = [[self.life.observation[name] for name in STATE_NAMES]]
-        return self.policy.navigate(self._pictures(), torch.tensor(state, device=self.policy.weights_device))
+        motion = (self.life.observation["x.vel"], self.life.observation["theta.vel"])
+        return self.policy.navigate(self._pictures(), self.learner.replay.next_trail(motion))
 
     def _pseudo_reset(self) -> None:
         for action in pseudo_reset(self._rng, self._pseudo_reset_steps, lambda: self.life.holding):

@@ -59,7 +59,9 @@ class Skills:
         self._picture: tuple[NDArray[np.uint8], NDArray[np.uint16]] | None = None
         self._grasped = False
         self._closed = False
-        self.last_velocity = (0.0, 0.0)  # m/s and deg/s, mean over the last drive pulse, from the wheel encoders
+        # m/s and deg/s, from the wheel encoders: how far the last navigation step has moved the robot, turns away from
+        # obstacles included, divided by the length of a drive pulse.
+        self.last_velocity = (0.0, 0.0)
         self.bumper = 0  # bits pressed during the last navigation step
 
     @property
@@ -90,6 +92,7 @@ class Skills:
             theta_vel: deg/s, positive = left.
         """
         self.bumper = 0
+        before = self._body.state()
         self._pulse(x_vel, theta_vel)
         bumped = self.bumper != 0
         if bumped:
@@ -97,6 +100,9 @@ class Skills:
             self._wait(_BACK_OFF_S)
             self._brake()
         self._turn_until_clear(at_least_once=bumped)
+        after = self._body.state()
+        travelled, turned = after.travelled - before.travelled, after.heading - before.heading
+        self.last_velocity = (travelled / DRIVE_PULSE_S, turned / DRIVE_PULSE_S)
 
     def grasp(self, x: float, y: float) -> bool:
         """Try to pick up what lies at a point of the floor (m, robot frame), and say whether it worked.
@@ -175,15 +181,9 @@ class Skills:
         logger.warning("Something obstructs the graspable area in every direction: the robot may be boxed in.")
 
     def _pulse(self, x_vel: float, theta_vel: float) -> None:
-        before = self._body.state()
         self._body.drive(x_vel, theta_vel)
         self._watch(DRIVE_PULSE_S, self._bumped if x_vel > 0 else lambda: False)
         self._brake()
-        after = self._body.state()
-        self.last_velocity = (
-            (after.travelled - before.travelled) / DRIVE_PULSE_S,
-            (after.heading - before.heading) / DRIVE_PULSE_S,
-        )
 
     def _bumped(self) -> bool:
         self.bumper |= self._body.state().bumper

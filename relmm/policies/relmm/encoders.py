@@ -15,6 +15,7 @@ from relmm.geometry import camera_geometry
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.floor import FloorView
 from relmm.policies.relmm.grasping import GraspEnsemble, RectifiedBackbone
+from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 # A pixel of the navigation map is 5x5 grasp cells, 5.5 cm: the grasp area is 3x3 pixels. The map reaches 1.78 m ahead
 # and 0.88 m to either side; farther off, an object is less than two pixels of the picture.
@@ -115,9 +116,7 @@ class Keypoints(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Features of a navigation observation: convolutions; over a map of the floor also keypoints and the last motion.
-
-    Without the motion a policy that sees nothing to drive to cannot know which way it has begun to turn, and dithers.
+    """Features of a navigation observation: convolutions; for a map of the floor also keypoints and the robot's trail.
 
     Args:
         kind: as in `ReLMMConfig.navigation_encoder`.
@@ -133,22 +132,22 @@ class Encoder(nn.Module):
         self.on_floor = kind == "floor"
         if self.on_floor:
             self.keypoints = Keypoints()
-            self.embed = nn.Sequential(nn.Linear(Keypoints.features + 2, _POINT_FEATURES), nn.ReLU())
+            self.embed = nn.Sequential(nn.Linear(Keypoints.features + TRAIL_FEATURES, _POINT_FEATURES), nn.ReLU())
         with torch.no_grad():
-            self.features: int = self(torch.zeros(1, *shape), torch.zeros(1, 2)).shape[1]
+            self.features: int = self(torch.zeros(1, *shape), torch.zeros(1, TRAIL_FEATURES)).shape[1]
 
-    def forward(self, observations: Tensor, motions: Tensor) -> Tensor:
+    def forward(self, observations: Tensor, trails: Tensor) -> Tensor:
         """Features, (batch, features).
 
         Args:
             observations: uint8, (batch, channels, height, width).
-            motions: forward and turn, about -1..1, (batch, 2).
+            trails: where the robot has just been, `Trail.features`, (batch, 15).
         """
         scaled = observations.float() / 127.5 - 1
         encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))
         if not self.on_floor:
             return encoded
-        points = self.embed(torch.cat([self.keypoints(scaled), motions], dim=1))
+        points = self.embed(torch.cat([self.keypoints(scaled), trails], dim=1))
         return torch.cat([encoded, points], dim=1)
 
 

@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.features import ACTION_NAMES, IMAGE_KEY, MAX_THETA_VEL, MAX_X_VEL, STATE_KEY, Skill, action_dict, xy_to_cell
+from relmm.features import ACTION_NAMES, IMAGE_KEY, MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict, xy_to_cell
 from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import make_observer
 from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch
+from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
 
 _SKILL = ACTION_NAMES.index("skill.pos")
 _PLACE = slice(ACTION_NAMES.index("skill_x.pos"), ACTION_NAMES.index("skill_y.pos") + 1)
@@ -51,9 +52,13 @@ class ReLMMPolicy(ControllerPolicy):
         """See `ControllerPolicy.decide`: greedily, or as while training if `sampling`."""
         pictures = self.to_pictures(image)
         estimate = self.look(pictures)
+        trail: Trail = row.memory.setdefault("trail", Trail())
+        if row.memory.pop("drove", False):
+            trail.moved(float(state[0]), float(state[1]))
         if row.attempts < self.config.num_grasp and self._wants_to_grasp(estimate, row):
             return self.grasp(estimate)
-        return self.navigate(pictures, torch.from_numpy(state[None]).to(self.weights_device))
+        row.memory["drove"] = True
+        return self.navigate(pictures, trail.features())
 
     def look(self, pictures: Tensor) -> Estimate:
         """The ensemble's opinion of pictures 0..1 (batch, 3, 100, 100), which is also remembered."""
@@ -70,10 +75,11 @@ class ReLMMPolicy(ControllerPolicy):
         cells = self.grasping.sample(estimate, self.rng) if self.sampling else estimate.mean.argmax(dim=1)
         return grasp_cell(int(cells[0]))
 
-    def navigate(self, pictures: Tensor, states: Tensor) -> dict[str, float]:
-        """A navigation step for one picture and state: the mean action, or a sampled one if `sampling`."""
+    def navigate(self, pictures: Tensor, trail: NDArray[np.float32]) -> dict[str, float]:
+        """A navigation step for one picture and trail: the mean action, or a sampled one if `sampling`."""
         observations = self.observer(pictures, self.grasping)
-        action = self.navigation.act(observations, to_motions(states), self.rng if self.sampling else None)[0]
+        trails = torch.from_numpy(trail[None]).to(self.weights_device)
+        action = self.navigation.act(observations, trails, self.rng if self.sampling else None)[0]
         return to_navigation_step(action.tolist())
 
     def to_pictures(self, image: NDArray[Any]) -> Tensor:
@@ -96,9 +102,8 @@ class ReLMMPolicy(ControllerPolicy):
         """The losses of the frames of a LeRobot batch: attempts teach the ensemble, navigation steps the navigation.
 
         Args:
-            batch: pictures (batch, time, 3, 100, 100) 0..1, `observation.state` (batch, time, 10), `action`
-                (batch, time, 5) and `next.reward` (batch, time), where time is `config.observation_delta_indices`; the
-                rest is not used.
+            batch: pictures (batch, time, 3, 100, 100) 0..1, `action` (batch, time, 5) and `next.reward` (batch, time),
+                where time is `config.observation_delta_indices`; the rest is not used.
             **kwargs: LeRobot's, not used.
         """
         skills = batch["action"][:, 0, _SKILL].round().long()
@@ -143,7 +148,7 @@ class ReLMMPolicy(ControllerPolicy):
         return replace(batch, rewards=batch.rewards + chance, continues=continues)
 
     def _navigation_batch(self, batch: dict[str, Any], steps: Tensor) -> NavigationBatch:
-        pictures, states, actions = batch[IMAGE_KEY][steps], batch[STATE_KEY][steps], batch["action"][steps]
+        pictures, actions = batch[IMAGE_KEY][steps], batch["action"][steps]
         attempted = actions[:, 1:, _SKILL].round() == Skill.GRASP
         # Only attempts that follow the step without another step between them are its outcome.
         own = attempted.long().cumprod(dim=1).bool()
@@ -151,13 +156,15 @@ class ReLMMPolicy(ControllerPolicy):
         after = (own.sum(dim=1) + 1).clamp(max=pictures.shape[1] - 1)
         rows = torch.arange(len(pictures), device=pictures.device)
         following = pictures[rows, after]
+        # Single frames know nothing of before: a robot that has just begun.
+        trails = torch.zeros(len(pictures), TRAIL_FEATURES, device=pictures.device)
         result = NavigationBatch(
             self.observer(pictures[:, 0], self.grasping),
-            to_motions(states[:, 0]),
+            trails,
             from_navigation_steps(actions[:, 0]),
             success.float() - 1,
             self.observer(following, self.grasping),
-            to_motions(states[rows, after]),
+            trails,
             1 - success.float(),
         )
         probabilities = self.grasping.grasp_probability(self.grasping.estimate(following))
@@ -170,11 +177,6 @@ class ReLMMPolicy(ControllerPolicy):
 def to_navigation_step(action: list[float]) -> dict[str, float]:
     """A navigation step for forward and turn in -1..1; -1 forward stands still, as in the authors' code."""
     return action_dict(x_vel=(action[0] + 1) / 2 * MAX_X_VEL, theta_vel=action[1] * MAX_THETA_VEL)
-
-
-def to_motions(states: Tensor) -> Tensor:
-    """How the robot last moved, forward and turn in about -1..1, (batch, 2), of states (batch, 10)."""
-    return torch.stack([states[:, 0] / MAX_X_VEL * 2 - 1, states[:, 1] / MAX_THETA_VEL], dim=1)
 
 
 def from_navigation_steps(actions: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import Encoder
+from relmm.policies.relmm.trail import MIRROR
 
 ACTIONS = 2  # forward and turn, each -1..1
 _LOG_STD_RANGE = (-5.0, 2.0)
@@ -23,18 +24,18 @@ class NavigationBatch:
 
     Attributes:
         observations, next_observations: uint8, (batch, channels, height, width).
-        motions, next_motions: how the robot had moved just before, forward and turn, about -1..1, (batch, 2).
+        trails, next_trails: where the robot had just been, `Trail.features`, (batch, 15).
         actions: -1..1, (batch, 2).
         rewards: -1..0, (batch,).
         continues: 1 where the search goes on, 0 after a success, or the probability of that, (batch,).
     """
 
     observations: Tensor
-    motions: Tensor
+    trails: Tensor
     actions: Tensor
     rewards: Tensor
     next_observations: Tensor
-    next_motions: Tensor
+    next_trails: Tensor
     continues: Tensor
 
     def mirrored(self) -> NavigationBatch:
@@ -43,10 +44,10 @@ class NavigationBatch:
         return replace(
             self,
             observations=self.observations.flip(-1),
-            motions=self.motions * sign,
+            trails=self.trails * MIRROR.to(sign.device),
             actions=self.actions * sign,
             next_observations=self.next_observations.flip(-1),
-            next_motions=self.next_motions * sign,
+            next_trails=self.next_trails * MIRROR.to(sign.device),
         )
 
 
@@ -97,9 +98,9 @@ class Critics(nn.Module):
         self.features = first.features
         self.heads = nn.ModuleList([_dense_layers(config, self.features + ACTIONS, 1) for _ in range(2)])
 
-    def encode(self, observations: Tensor, motions: Tensor) -> list[Tensor]:
+    def encode(self, observations: Tensor, trails: Tensor) -> list[Tensor]:
         """Features for each head, two of (batch, features)."""
-        encoded = [encoder(observations, motions) for encoder in self.encoders]
+        encoded = [encoder(observations, trails) for encoder in self.encoders]
         return encoded * 2 if len(encoded) == 1 else encoded
 
     def forward(self, features: list[Tensor], actions: Tensor) -> Tensor:
@@ -126,10 +127,10 @@ class Navigation(nn.Module):
         self.actor = Actor(config, self.critics.features)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.initial_temperature)))
 
-    def act(self, observations: Tensor, motions: Tensor, rng: torch.Generator | None) -> Tensor:
+    def act(self, observations: Tensor, trails: Tensor, rng: torch.Generator | None) -> Tensor:
         """Actions -1..1, (batch, 2): sampled, or the mean action without random numbers."""
         with torch.no_grad():
-            features = self._actor_features(observations, motions)
+            features = self._actor_features(observations, trails)
             if rng is None:
                 mean: Tensor = self.actor(features)[0].tanh()
                 return mean
@@ -148,12 +149,12 @@ class Navigation(nn.Module):
         """
         temperature = self.log_temperature.exp().detach()
         targets = self.bellman_targets(batch, noise[1], temperature)
-        features = self.critics.encode(batch.observations, batch.motions)
+        features = self.critics.encode(batch.observations, batch.trails)
         values = self.critics(features, batch.actions)
         critic_loss = functional.mse_loss(values, targets.expand_as(values))
 
         actions, log_density = self.actor.sample(
-            self._actor_features(batch.observations, batch.motions, features), noise[0]
+            self._actor_features(batch.observations, batch.trails, features), noise[0]
         )
         # Through the critics to the actions, but not into the critics.
         self.critics.requires_grad_(False)
@@ -175,7 +176,7 @@ class Navigation(nn.Module):
     @torch.no_grad()
     def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:
         """R + gamma * (1 - terminal) * (min Q'(o', a') - temperature * log pi(a'|o')), (batch,)."""
-        following = (batch.next_observations, batch.next_motions)
+        following = (batch.next_observations, batch.next_trails)
         actions, log_density = self.actor.sample(self._actor_features(*following), noise)
         values = self.targets(self.targets.encode(*following), actions).amin(dim=0)
         targets = batch.rewards + self.config.gamma * batch.continues * (values - temperature * log_density)
@@ -187,11 +188,11 @@ class Navigation(nn.Module):
         for target, weight in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             target.lerp_(weight, self.config.tau)
 
-    def _actor_features(self, observations: Tensor, motions: Tensor, shared: list[Tensor] | None = None) -> Tensor:
+    def _actor_features(self, observations: Tensor, trails: Tensor, shared: list[Tensor] | None = None) -> Tensor:
         if self.actor_encoder is not None:
-            features: Tensor = self.actor_encoder(observations, motions)
+            features: Tensor = self.actor_encoder(observations, trails)
             return features
-        return (self.critics.encode(observations, motions) if shared is None else shared)[0].detach()
+        return (self.critics.encode(observations, trails) if shared is None else shared)[0].detach()
 
 
 def _dense_layers(config: ReLMMConfig, inputs: int, outputs: int) -> nn.Sequential:
