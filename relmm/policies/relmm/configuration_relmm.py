@@ -58,6 +58,7 @@ class ReLMMConfig(ControllerConfig):
         min_steps_to_update: transitions stored before the first update.
         gamma: discount of a navigation step.
         tau: step of the target networks' moving average.
+        actor_tau: step of the moving average of the actor that greedy actions come from; 1 for the actor itself.
         target_entropy: of SAC's temperature.
         initial_temperature: of SAC.
         clip_targets: keep Bellman targets within what rewards of -1 to 0 allow.
@@ -106,6 +107,7 @@ class ReLMMConfig(ControllerConfig):
     min_steps_to_update: int = 100
     gamma: float = 0.98
     tau: float = 0.01
+    actor_tau: float = 0.003
     target_entropy: float = -2.0
     initial_temperature: float = 0.1
     clip_targets: bool = True
@@ -181,6 +183,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "min_steps_to_update": (1, math.inf),
     "gamma": (0, 0.9999),
     "tau": (_TINY, 1),
+    "actor_tau": (_TINY, 1),
     "initial_temperature": (_TINY, math.inf),
     "pseudo_reset_share": (0, 0.9),
     "refreshed_maps": (0, math.inf),

@@ -125,15 +125,18 @@ class Navigation(nn.Module):
         shared = config.navigation_encoder == "floor"
         self.actor_encoder = None if shared else Encoder(config.navigation_encoder)
         self.actor = Actor(config, self.critics.features)
+        # Greedy actions come from a moving average of the actor, which varies less from one update to the next.
+        self.mean_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.mean_encoder = copy.deepcopy(self._encoder).requires_grad_(False)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.initial_temperature)))
 
     def act(self, observations: Tensor, trails: Tensor, rng: torch.Generator | None) -> Tensor:
         """Actions -1..1, (batch, 2): sampled, or the mean action without random numbers."""
         with torch.no_grad():
-            features = self._actor_features(observations, trails)
             if rng is None:
-                mean: Tensor = self.actor(features)[0].tanh()
+                mean: Tensor = self.mean_actor(self.mean_encoder(observations, trails))[0].tanh()
                 return mean
+            features = self._actor_features(observations, trails)
             noise = torch.randn(len(observations), ACTIONS, generator=rng).to(features.device)
             return self.actor.sample(features, noise)[0]
 
@@ -184,15 +187,29 @@ class Navigation(nn.Module):
 
     @torch.no_grad()
     def update_targets(self) -> None:
-        """Move the target networks by `tau` towards the critics."""
-        for target, weight in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
-            target.lerp_(weight, self.config.tau)
+        """Move the targets by `tau` towards the critics, and the mean actor by `actor_tau` towards the actor."""
+        _follow(self.targets, self.critics, self.config.tau)
+        _follow(self.mean_actor, self.actor, self.config.actor_tau)
+        _follow(self.mean_encoder, self._encoder, self.config.actor_tau)
+
+    @property
+    def _encoder(self) -> Encoder:
+        """The actor's."""
+        encoder = self.actor_encoder or self.critics.encoders[0]
+        assert isinstance(encoder, Encoder)
+        return encoder
 
     def _actor_features(self, observations: Tensor, trails: Tensor, shared: list[Tensor] | None = None) -> Tensor:
         if self.actor_encoder is not None:
             features: Tensor = self.actor_encoder(observations, trails)
             return features
         return (self.critics.encode(observations, trails) if shared is None else shared)[0].detach()
+
+
+def _follow(mean: nn.Module, module: nn.Module, rate: float) -> None:
+    """Move the weights of a moving average."""
+    for average, weight in zip(mean.parameters(), module.parameters(), strict=True):
+        average.lerp_(weight, rate)
 
 
 def _dense_layers(config: ReLMMConfig, inputs: int, outputs: int) -> nn.Sequential:
