@@ -17,7 +17,7 @@ Fill = Callable[..., Replay]
 
 
 @pytest.fixture
-def fill(numbered, action_of) -> Fill:
+def fill(numbered, motion_of, action_of) -> Fill:
     """A replay of a life, frame by frame."""
 
     def replay_of(life: Life, capacity: int = 500) -> Replay:
@@ -26,7 +26,7 @@ def fill(numbered, action_of) -> Fill:
             for kind in episode:
                 phase = Phase.PSEUDO_RESET if kind == "r" else Phase.LEARNING
                 number = replay.frames
-                replay.add(numbered(number), action_of(SKILLS[kind], number), kind == "s", phase)
+                replay.add(numbered(number), motion_of(number), action_of(SKILLS[kind], number), kind == "s", phase)
             replay.save_episode()
         return replay
 
@@ -138,7 +138,7 @@ def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> N
     replay = Replay(10)
     lengths = []
     for kind in "dffd":
-        replay.add(numbered(0), action_of(SKILLS[kind], 0), False, Phase.LEARNING)
+        replay.add(numbered(0), (0.0, 0.0), action_of(SKILLS[kind], 0), False, Phase.LEARNING)
         lengths.append(len(replay.steps))
     assert lengths == [0, 0, 0, 1]
 
@@ -164,12 +164,14 @@ def test_frames_are_taken_as_recorders_take_them(numbered) -> None:
     drive = action_dict(x_vel=MAX_X_VEL, theta_vel=-MAX_THETA_VEL / 2)
     for number, (action, reward) in enumerate([(drive, 0.0), (grasp_cell(17), 1.0)]):
         outcome = {"next.reward": reward, "complementary_info.phase": int(Phase.LEARNING)}
-        replay.add_frame({FRONT: numbered(number)}, action, outcome, "task")
+        observation = {FRONT: numbered(number), "x.vel": number * MAX_X_VEL, "theta.vel": 0.5 * MAX_THETA_VEL}
+        replay.add_frame(observation, action, outcome, "task")
     replay.save_episode()
     assert {name: values.tolist() for name, values in replay.steps.rows(np.array([0])).items()} == {
         "frame": [0], "next": [1], "forward": [1.0], "turn": [-0.5], "success": [True]
     }  # fmt: skip
     assert replay.attempts["cell"].tolist() == [17]
+    assert replay.motions(np.array([1, 0])).tolist() == [[1.0, 0.5], [-1.0, 0.5]]
     assert np.array_equal(replay.pictures(np.array([1]))[0], numbered(1))
 
 
@@ -189,6 +191,7 @@ def test_what_is_sampled_still_has_its_pictures(capacity: int, seed: int, fill: 
         assert [number_of(image) for image in replay.pictures(frames)] == frames.tolist()
     after = replay.steps["next"][replay.sample(replay.steps, 50, rng)]
     assert [number_of(image) for image in replay.pictures(after)] == after.tolist()
+    assert replay.motions(after)[:, 0] == pytest.approx(after % 500 / 250 - 1, abs=1e-6)
 
 
 def test_rows_are_sampled_uniformly(fill: Fill) -> None:

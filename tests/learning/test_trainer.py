@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from relmm.features import FRONT, GRID, Phase, Skill, action_dict, in_grasp_area, xy_to_cell
+from relmm.features import FRONT, GRID, STATE_NAMES, Phase, Skill, action_dict, in_grasp_area, xy_to_cell
 from relmm.learning.life import Life
 from relmm.learning.progress import Progress
 from relmm.learning.trainer import Trainer
@@ -62,7 +62,8 @@ class World:
     phase = Phase.LEARNING  # of the action to come
 
     def get_observation(self) -> dict[str, Any]:
-        return {FRONT: np.full((2, 2, 3), 255 * self.grasp_wanted, np.uint8), "holding.pos": float(self.holding)}
+        picture = np.full((2, 2, 3), 255 * self.grasp_wanted, np.uint8)
+        return {**dict.fromkeys(STATE_NAMES, 0.5), "holding.pos": float(self.holding), FRONT: picture}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         self.actions.append(action)
@@ -84,6 +85,7 @@ class FakePolicy:
 
     sampling = False
     rng = None
+    weights_device = torch.device("cpu")
     floor_probability = 0.0
 
     def __init__(self, config: ReLMMConfig) -> None:
@@ -97,7 +99,7 @@ class FakePolicy:
     def look(self, image: np.ndarray) -> None:
         self.grasp_probability = 1.0 if image.max() else self.floor_probability
 
-    def navigate(self, image: np.ndarray) -> dict[str, float]:
+    def navigate(self, image: np.ndarray, states: torch.Tensor) -> dict[str, float]:
         return POLICY_DRIVE
 
 

@@ -8,7 +8,7 @@ from torch.nn import functional
 from relmm.features import GRASP_X, GRASP_Y, GRID
 from relmm.geometry import camera_geometry
 from relmm.policies.relmm.configuration_relmm import NAVIGATION_ENCODERS
-from relmm.policies.relmm.encoders import Encoder, FloorObserver, PictureObserver, make_observer
+from relmm.policies.relmm.encoders import Encoder, FloorObserver, Keypoints, PictureObserver, make_observer
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.grasping import GraspEnsemble
 
@@ -33,9 +33,9 @@ def to_images(picture: np.ndarray) -> torch.Tensor:
 
 # --- The map -------------------------------------------------------------------------------------------------
 def test_map_agrees_with_the_grasp_cells_where_the_arm_reaches(observer, ensemble, noise_pictures) -> None:
-    """The map is drawn by the first member; a pixel shows the best of its 5x5 cells."""
+    """The map is drawn by the first two members; a pixel shows the best of its 5x5 cells."""
     images = noise_pictures(2)
-    cells = ensemble.logits(images)[0].sigmoid().reshape(2, GRID // PIXEL, PIXEL, GRID // PIXEL, PIXEL)
+    cells = ensemble.logits(images)[:2].mean(dim=0).sigmoid().reshape(2, GRID // PIXEL, PIXEL, GRID // PIXEL, PIXEL)
     drawn = observer(images, ensemble)[:, 0][:, *REACH]
     assert (drawn.float() - cells.amax(dim=(2, 4)) * 255).abs().max() <= 1
 
@@ -102,7 +102,7 @@ def test_observation_and_features_have_the_promised_shapes(kind: str, make_confi
     assert observations.dtype == torch.uint8
     assert observations.shape == (2, *observer.shape)
     encoder = Encoder(kind)
-    assert encoder(observations).shape == (2, encoder.features)
+    assert encoder(observations, torch.zeros(2, 2)).shape == (2, encoder.features)
 
 
 def test_paper_encoder_is_that_of_the_authors() -> None:
@@ -120,5 +120,43 @@ def test_encoder_scales_its_input_to_plus_and_minus_1() -> None:
     encoder = Encoder("floor")
     seen: list[torch.Tensor] = []
     encoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    encoder(torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 4, 32, 33))
+    encoder(torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 4, 32, 33), torch.zeros(2, 2))
     assert [float(values.min()) for values in seen[0]] == [float(values.max()) for values in seen[0]] == [-1.0, 1.0]
+
+
+@pytest.mark.parametrize(("kind", "used"), [("floor", True), ("paper", False), ("paper_small", False)])
+def test_last_motion_is_a_feature_of_the_floor_only(kind: str, used: bool) -> None:
+    """The paper's navigation sees the picture alone."""
+    torch.manual_seed(0)
+    shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
+    observations, encoder = torch.zeros(1, *shape, dtype=torch.uint8), Encoder(kind)
+    left, right = (encoder(observations, torch.tensor([[0.0, turn]])) for turn in (1.0, -1.0))
+    assert torch.equal(left, right) != used
+
+
+# --- Keypoints -----------------------------------------------------------------------------------------------
+def keypoints(*pixels: tuple[int, int]) -> torch.Tensor:
+    """What fresh keypoints, (x, y, graspability) by head, make of a map with graspable pixels; (heads, 3)."""
+    torch.manual_seed(0)
+    maps = torch.full((1, *FloorObserver.shape), -1.0)
+    for row, column in pixels:
+        maps[0, 0, row, column] = 1.0
+    return Keypoints()(maps).detach().reshape(-1, 3)
+
+
+@pytest.mark.parametrize("pixel", [(2, 16), (8, 10), (15, 25), (1, 15)])
+def test_keypoints_tell_where_a_graspable_thing_lies(pixel: tuple[int, int]) -> None:
+    """In m from the middle of the grasp area, forward and left; a pixel is five cells."""
+    place = [(pixel[0] - 2) * (GRASP_X[1] - GRASP_X[0]) / 3, (pixel[1] - 16) * (GRASP_Y[1] - GRASP_Y[0]) / 3]
+    farsighted = keypoints(pixel)[-1]
+    assert farsighted[:2].tolist() == pytest.approx(place, abs=0.06)
+    assert farsighted[2] > 0.9
+
+
+def test_keypoints_prefer_the_nearest_thing() -> None:
+    """The near-sighted ones see it alone; the others, ever less, lean to it."""
+    near, far, both = keypoints((4, 12)), keypoints((18, 24)), keypoints((4, 12), (18, 24))
+    to_near, to_far = ((both - one)[:, :2].norm(dim=1) for one in (near, far))
+    assert to_near[:2].max() < 0.02
+    assert (to_near.diff() > 0).all()
+    assert (to_near < to_far).all()

@@ -14,6 +14,7 @@ from relmm.policies.relmm.navigation import Actor, Navigation, NavigationBatch
 
 SIZE = 5
 KINDS = ["floor", "paper_small"]
+Seen = tuple[Tensor, Tensor]  # an observation and the motion before it
 MakeNavigation = Callable[..., Navigation]
 
 
@@ -22,10 +23,16 @@ class DoubleEncoder(nn.Module):
 
     def __init__(self, encoder: Encoder) -> None:
         super().__init__()
-        self.layers = encoder.layers
+        self.layers, self.on_floor = encoder.layers, encoder.on_floor
+        if encoder.on_floor:
+            self.keypoints, self.embed = encoder.keypoints, encoder.embed
 
-    def forward(self, observations: Tensor) -> Tensor:
-        return self.layers(observations.double() / 127.5 - 1)
+    def forward(self, observations: Tensor, motions: Tensor) -> Tensor:
+        scaled = observations.double() / 127.5 - 1
+        encoded = self.layers(scaled)
+        if not self.on_floor:
+            return encoded
+        return torch.cat([encoded, self.embed(torch.cat([self.keypoints(scaled), motions], dim=1))], dim=1)
 
 
 @pytest.fixture
@@ -51,60 +58,69 @@ def make_batch(kind: str = "floor") -> NavigationBatch:
     rng = torch.Generator().manual_seed(1)
     shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
     observations, following = torch.randint(0, 256, (2, SIZE, *shape), dtype=torch.uint8, generator=rng)
-    actions = torch.rand(SIZE, 2, dtype=torch.double, generator=rng) * 2 - 1
+    actions, motions, next_motions = torch.rand(3, SIZE, 2, dtype=torch.double, generator=rng) * 2 - 1
     rewards = torch.tensor([-1.0, 0.0, -0.4, -1.0, -0.9], dtype=torch.double)
-    return NavigationBatch(observations, actions, rewards, following, torch.tensor([1, 0, 0.6, 1, 1.0]).double())
+    continues = torch.tensor([1, 0, 0.6, 1, 1.0]).double()
+    return NavigationBatch(observations, motions, actions, rewards, following, next_motions, continues)
 
 
 def make_noise() -> Tensor:
     return torch.randn(2, SIZE, 2, dtype=torch.double, generator=torch.Generator().manual_seed(2))
 
 
+def before(batch: NavigationBatch) -> Seen:
+    return batch.observations, batch.motions
+
+
+def after(batch: NavigationBatch) -> Seen:
+    return batch.next_observations, batch.next_motions
+
+
 # --- The same in other words ---------------------------------------------------------------------------------
-def policy_at(navigation: Navigation, observations: Tensor) -> Independent:
+def policy_at(navigation: Navigation, *seen: Tensor) -> Independent:
     """The actor's distribution before the tanh."""
     encoder = navigation.actor_encoder or navigation.critics.encoders[0]
-    outputs = navigation.actor.net(encoder(observations))
+    outputs = navigation.actor.net(encoder(*seen))
     log_std = outputs[:, 2:]
     if navigation.actor_encoder is None:
         log_std = log_std.clamp(-5, 2)
     return Independent(Normal(outputs[:, :2], log_std.exp()), 1)
 
 
-def act_at(navigation: Navigation, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    before = policy_at(navigation, observations)
-    raw = before.base_dist.loc + before.base_dist.scale * noise
-    return raw.tanh(), before.log_prob(raw) - torch.log1p(-raw.tanh().square()).sum(dim=1)
+def act_at(navigation: Navigation, seen: Seen, noise: Tensor) -> tuple[Tensor, Tensor]:
+    gaussian = policy_at(navigation, *seen)
+    raw = gaussian.base_dist.loc + gaussian.base_dist.scale * noise
+    return raw.tanh(), gaussian.log_prob(raw) - torch.log1p(-raw.tanh().square()).sum(dim=1)
 
 
-def values_at(critics: Any, observations: Tensor, actions: Tensor) -> list[Tensor]:
+def values_at(critics: Any, seen: Seen, actions: Tensor) -> list[Tensor]:
     encoders = list(critics.encoders) * (2 // len(critics.encoders))
     return [
-        head(torch.cat([encoder(observations), actions], dim=1))[:, 0]
+        head(torch.cat([encoder(*seen), actions], dim=1))[:, 0]
         for head, encoder in zip(critics.heads, encoders, strict=True)
     ]
 
 
 def targets_at(navigation: Navigation, batch: NavigationBatch, noise: Tensor) -> Tensor:
-    actions, log_density = act_at(navigation, batch.next_observations, noise)
-    first, second = values_at(navigation.targets, batch.next_observations, actions)
-    after = torch.minimum(first, second) - navigation.log_temperature.exp() * log_density
-    return batch.rewards + navigation.config.gamma * batch.continues * after
+    actions, log_density = act_at(navigation, after(batch), noise)
+    first, second = values_at(navigation.targets, after(batch), actions)
+    value = torch.minimum(first, second) - navigation.log_temperature.exp() * log_density
+    return batch.rewards + navigation.config.gamma * batch.continues * value
 
 
 def critic_loss(navigation: Navigation, batch: NavigationBatch, targets: Tensor) -> Tensor:
-    first, second = values_at(navigation.critics, batch.observations, batch.actions)
+    first, second = values_at(navigation.critics, before(batch), batch.actions)
     return ((first - targets).square().mean() + (second - targets).square().mean()) / 2
 
 
 def actor_loss(navigation: Navigation, batch: NavigationBatch, noise: Tensor) -> Tensor:
-    actions, log_density = act_at(navigation, batch.observations, noise)
-    first, second = values_at(navigation.critics, batch.observations, actions)
+    actions, log_density = act_at(navigation, before(batch), noise)
+    first, second = values_at(navigation.critics, before(batch), actions)
     return (navigation.log_temperature.exp() * log_density - torch.minimum(first, second)).mean()
 
 
 def temperature_loss(navigation: Navigation, batch: NavigationBatch, noise: Tensor) -> Tensor:
-    log_density = act_at(navigation, batch.observations, noise)[1]
+    log_density = act_at(navigation, before(batch), noise)[1]
     return -navigation.log_temperature.exp() * (log_density + navigation.config.target_entropy).mean()
 
 
@@ -137,7 +153,7 @@ def test_loss_is_the_sum_of_the_three_of_sac(kind: str, make_navigation: MakeNav
     assert logs["actor_loss"] == pytest.approx(actor)
     assert loss.item() == pytest.approx(critics + actor + temperature)
     assert logs["temperature"] == pytest.approx(navigation.config.initial_temperature)
-    assert logs["entropy"] == pytest.approx(-act_at(navigation, batch.observations, noise[0])[1].mean().item())
+    assert logs["entropy"] == pytest.approx(-act_at(navigation, before(batch), noise[0])[1].mean().item())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -184,7 +200,7 @@ def constant(navigation: Navigation, *values: float) -> None:
 def test_targets_take_the_smaller_value_and_add_entropy(make_navigation: MakeNavigation) -> None:
     navigation, batch, noise = make_navigation(gamma=0.9, clip_targets=False), make_batch(), make_noise()
     constant(navigation, -3.0, -5.0)
-    log_density = act_at(navigation, batch.next_observations, noise[1])[1].tolist()
+    log_density = act_at(navigation, after(batch), noise[1])[1].tolist()
     rows = zip(batch.rewards.tolist(), batch.continues.tolist(), log_density, strict=True)
     expected = [reward + 0.9 * continues * (-5.0 - 0.1 * density) for reward, continues, density in rows]
     targets = navigation.bellman_targets(batch, noise[1], torch.tensor(0.1, dtype=torch.double))
@@ -259,12 +275,14 @@ def test_deviation_is_limited_for_the_floor_only(kind: str, expected: tuple[floa
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_greedy_action_is_the_mean_and_sampled_ones_follow_the_actor(kind: str, make_navigation) -> None:
-    navigation, observations = make_navigation(kind), make_batch(kind).observations[:1]
-    before = policy_at(navigation, observations).base_dist
-    assert torch.allclose(navigation.act(observations, None), before.loc.tanh())
-    many = navigation.act(observations.expand(200, -1, -1, -1), torch.Generator().manual_seed(0)).atanh()
-    assert torch.allclose(many.mean(dim=0), before.loc[0], atol=4 * before.scale.max().item() / math.sqrt(200))
-    assert torch.allclose(many.std(dim=0), before.scale[0], rtol=0.2)
+    navigation = make_navigation(kind)
+    observations, motions = (column[:1] for column in before(make_batch(kind)))
+    gaussian = policy_at(navigation, observations, motions).base_dist
+    assert torch.allclose(navigation.act(observations, motions, None), gaussian.loc.tanh())
+    many = observations.expand(200, -1, -1, -1), motions.expand(200, -1)
+    raw = navigation.act(*many, torch.Generator().manual_seed(0)).atanh()
+    assert torch.allclose(raw.mean(dim=0), gaussian.loc[0], atol=4 * gaussian.scale.max().item() / math.sqrt(200))
+    assert torch.allclose(raw.std(dim=0), gaussian.scale[0], rtol=0.2)
 
 
 # --- Mirror --------------------------------------------------------------------------------------------------
@@ -273,7 +291,9 @@ def test_mirrored_batch_exchanges_left_and_right_and_nothing_else() -> None:
     mirrored = batch.mirrored()
     assert torch.equal(mirrored.observations[..., 0], batch.observations[..., -1])
     assert torch.equal(mirrored.next_observations.flip(-1), batch.next_observations)
-    assert torch.equal(mirrored.actions[:, 0], batch.actions[:, 0])
-    assert torch.equal(mirrored.actions[:, 1], -batch.actions[:, 1])
+    for name in ("actions", "motions", "next_motions"):
+        turned, straight = getattr(mirrored, name), getattr(batch, name)
+        assert torch.equal(turned[:, 0], straight[:, 0])
+        assert torch.equal(turned[:, 1], -straight[:, 1])
     assert mirrored.rewards is batch.rewards
     assert mirrored.continues is batch.continues
