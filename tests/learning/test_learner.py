@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -150,8 +150,8 @@ def test_navigation_batch_is_that_of_its_frames(relabel: bool, make_learner, num
         chance = 0.0 if success or not relabel else chance
         assert (batch.observations[row].int() - observations[0]).abs().max() <= 1
         assert (batch.next_observations[row].int() - observations[1]).abs().max() <= 1
-        assert batch.motions[row, 0].item() == pytest.approx(frame / 250 - 1, abs=1e-6)
-        assert batch.next_motions[row, 0].item() == pytest.approx(after / 250 - 1, abs=1e-6)
+        trails = learner.replay.trails(np.array([frame, after]))
+        assert np.array_equal(torch.stack([batch.trails[row], batch.next_trails[row]]), trails)
         assert batch.rewards[row].item() == pytest.approx(float(success) - 1 + chance, abs=1e-5)
         assert batch.continues[row].item() == pytest.approx(1 - float(success) - chance * (not success), abs=1e-5)
         assert batch.actions[row].tolist() == pytest.approx([2 * frame / 1000 - 1, frame / 1000], abs=1e-6)
@@ -222,7 +222,7 @@ def test_recorded_episode_fills_the_replay_as_living_it_does(make_learner, recor
         for name, column in read.rows(rows).items():
             assert column == pytest.approx(wanted.rows(rows)[name], abs=1e-6)
     frames = np.arange(7)
-    assert learner.replay.motions(frames) == pytest.approx(lived.replay.motions(frames), abs=1e-6)
+    assert learner.replay.trails(frames) == pytest.approx(lived.replay.trails(frames), abs=1e-6)
     assert (learner.replay.frames, learner.replay.episodes) == (7, 1)
     assert learner.logs == {}
 
@@ -249,10 +249,10 @@ def test_frozen_ensemble_learns_from_recorded_curricula_only(make_learner, recor
 
 
 def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> None:
-    """LeRobot's dataset, batches and preprocessor against the replay, on recorded episodes."""
+    """LeRobot's dataset, batches and preprocessor against the replay, but for the trails that single frames lack."""
     policy = make_policy(refreshed_maps=0, seed=2)
     deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
-    columns = dict.fromkeys((IMAGE_KEY, STATE_KEY, "action", "next.reward"), deltas)
+    columns = dict.fromkeys((IMAGE_KEY, "action", "next.reward"), deltas)
     frames = list(LeRobotDataset("local/diverse", root=RECORDED, delta_timestamps=columns, episodes=[0, 1, 2]))
     learner, episode = Learner(policy, Replay(len(frames)), seed=0), 0
     for frame in frames:
@@ -261,7 +261,7 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
         episode = frame["episode_index"]
         picture = (frame[IMAGE_KEY][0] * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
         phase = int(frame["complementary_info.phase"])
-        motion, success = frame[STATE_KEY][0, :2].tolist(), bool(frame["next.reward"][0] > 0)
+        motion, success = frame[STATE_KEY][:2].tolist(), bool(frame["next.reward"][0] > 0)
         learner.replay.add(picture, motion, frame["action"][0], success, phase)
     learner.replay.save_episode()
     policy.eval()
@@ -275,6 +275,8 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
     rows = {name: np.concatenate([part[name] for part in every]) for name in every[0]}
     order = np.argsort(rows["frame"])
     steps = learner.navigation_batch({name: column[order] for name, column in rows.items()})
+    assert steps.trails.any()
+    steps = replace(steps, trails=torch.zeros_like(steps.trails), next_trails=torch.zeros_like(steps.trails))
     torch.manual_seed(3)
     navigation_loss, wanted = policy.navigation.loss(steps, torch.randn(2, len(order), 2))
     pictures = to_pictures(replay.pictures(replay.attempts["frame"]), torch.device("cpu"))

@@ -11,6 +11,7 @@ from relmm.policies.relmm.configuration_relmm import NAVIGATION_ENCODERS
 from relmm.policies.relmm.encoders import Encoder, FloorObserver, Keypoints, PictureObserver, make_observer
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.grasping import GraspEnsemble
+from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 REACH = (slice(1, 4), slice(15, 18))  # pixels of the map that the grasp cells make up
 PIXEL = 5  # cells a side
@@ -102,7 +103,7 @@ def test_observation_and_features_have_the_promised_shapes(kind: str, make_confi
     assert observations.dtype == torch.uint8
     assert observations.shape == (2, *observer.shape)
     encoder = Encoder(kind)
-    assert encoder(observations, torch.zeros(2, 2)).shape == (2, encoder.features)
+    assert encoder(observations, torch.zeros(2, TRAIL_FEATURES)).shape == (2, encoder.features)
 
 
 def test_paper_encoder_is_that_of_the_authors() -> None:
@@ -120,17 +121,20 @@ def test_encoder_scales_its_input_to_plus_and_minus_1() -> None:
     encoder = Encoder("floor")
     seen: list[torch.Tensor] = []
     encoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    encoder(torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 4, 32, 33), torch.zeros(2, 2))
+    encoder(
+        torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 4, 32, 33),
+        torch.zeros(2, TRAIL_FEATURES),
+    )
     assert [float(values.min()) for values in seen[0]] == [float(values.max()) for values in seen[0]] == [-1.0, 1.0]
 
 
 @pytest.mark.parametrize(("kind", "used"), [("floor", True), ("paper", False), ("paper_small", False)])
-def test_last_motion_is_a_feature_of_the_floor_only(kind: str, used: bool) -> None:
+def test_trail_is_a_feature_of_the_floor_only(kind: str, used: bool) -> None:
     """The paper's navigation sees the picture alone."""
     torch.manual_seed(0)
     shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
     observations, encoder = torch.zeros(1, *shape, dtype=torch.uint8), Encoder(kind)
-    left, right = (encoder(observations, torch.tensor([[0.0, turn]])) for turn in (1.0, -1.0))
+    left, right = (encoder(observations, torch.full((1, TRAIL_FEATURES), side)) for side in (1.0, -1.0))
     assert torch.equal(left, right) != used
 
 

@@ -22,15 +22,15 @@ from relmm.features import (
     MAX_THETA_VEL,
     MAX_X_VEL,
     STATE_KEY,
-    STATE_NAMES,
     Skill,
     action_dict,
     cell_to_xy,
     xy_to_cell,
 )
 from relmm.policies.controller import grasp_cell
-from relmm.policies.relmm.modeling_relmm import ReLMMPolicy, from_navigation_steps, to_motions, to_navigation_step
+from relmm.policies.relmm.modeling_relmm import ReLMMPolicy, from_navigation_steps, to_navigation_step
 from relmm.policies.relmm.navigation import NavigationBatch
+from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
 from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
 
 CELLS = GRID**2
@@ -211,18 +211,23 @@ def test_navigation_steps_beyond_the_range_are_clipped() -> None:
     assert from_navigation_steps(steps).tolist() == [[-1.0, 1.0], [1.0, -1.0]]
 
 
-def test_motions_are_counted_as_the_actions_that_caused_them() -> None:
-    step = to_navigation_step([0.4, -0.6])
-    state = torch.zeros(1, len(STATE_NAMES))
-    state[0, :2] = torch.tensor([step["x.vel"], step["theta.vel"]])
-    assert to_motions(state).tolist()[0] == pytest.approx([0.4, -0.6])
-
-
-def test_policy_that_drives_knows_how_it_last_moved(make_policy_of: MakePolicy, make_batch, empty) -> None:
-    policy = make_policy_of(seed=1, grasp_threshold=1.0)
-    left, right = make_batch(empty), make_batch(empty)
-    left[STATE_KEY][0, 1], right[STATE_KEY][0, 1] = MAX_THETA_VEL, -MAX_THETA_VEL
-    assert not torch.equal(policy.select_action(left), policy.select_action(right))
+def test_policy_remembers_its_trail_from_the_drives_it_asked_for(make_policy_of, make_batch, empty) -> None:
+    """A step's velocities are in the state after it; attempts and placements are no steps."""
+    policy, given = make_policy_of(seed=1, grasp_threshold=1.0), []
+    navigate = policy.navigate
+    policy.navigate = lambda pictures, trail: (given.append(trail), navigate(pictures, trail))[1]
+    driven, batch, expected = [(0.1, 30.0), (0.2, -60.0), (0.0, 90.0)], make_batch(empty), Trail()
+    policy.select_action(batch)
+    assert np.array_equal(given[-1], expected.features()), "what came before the first step is unknown"
+    for motion in driven:
+        batch[STATE_KEY][0, :2] = torch.tensor(motion)
+        policy.select_action(make_batch(empty, holding=(0,)))
+        policy.select_action(batch)
+        expected.moved(*motion)
+        assert given[-1] == pytest.approx(expected.features(), abs=1e-6)
+    policy.reset()
+    policy.select_action(batch)
+    assert np.array_equal(given[-1], Trail().features())
 
 
 # --- Seeds, files and LeRobot --------------------------------------------------------------------------------
@@ -287,8 +292,8 @@ def test_steps_without_success_are_rewarded_with_the_grasp_probability(
     policy = make_policy_of("dense", relabel=relabel, relabel_terminal=terminal)
     pictures = torch.zeros(3, 1, 1, 1, dtype=torch.uint8)
     success = torch.tensor([0.0, 0.0, 1.0])
-    still = torch.zeros(3, 2)
-    batch = NavigationBatch(pictures, still, still, success - 1, pictures, still, 1 - success)
+    still, trails = torch.zeros(3, 2), torch.zeros(3, TRAIL_FEATURES)
+    batch = NavigationBatch(pictures, trails, still, success - 1, pictures, trails, 1 - success)
     result = policy.relabel(batch, torch.tensor([0.3, 0.0, 0.9]), success < 0.5)
     assert result.rewards.tolist() == pytest.approx(rewards)
     assert result.continues.tolist() == pytest.approx(continues)
@@ -302,7 +307,7 @@ LAST_NOT_FIRST = pytest.mark.xfail(
 TOO_SHORT = pytest.mark.xfail(
     strict=True, reason="forward sees num_grasp + 1 frames after a drive, but the attempts of a curriculum go on"
 )
-Frame = tuple[NDArray[np.uint8], list[float], dict[str, float], float]  # picture, state, action, reward
+Frame = tuple[NDArray[np.uint8], dict[str, float], float]  # picture, action, reward
 DRIVE = action_dict(x_vel=0.3, theta_vel=-40.0)
 
 
@@ -312,9 +317,8 @@ def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> di
     rows = [[episode[min(index, len(episode) - 1)] for index in row] for row in wanted]
     return {
         IMAGE_KEY: torch.from_numpy(np.stack([[f[0] for f in row] for row in rows])).permute(0, 1, 4, 2, 3) / 255,
-        STATE_KEY: torch.tensor([[f[1] for f in row] for row in rows]),
-        "action": torch.tensor([[[f[2][name] for name in ACTION_NAMES] for f in row] for row in rows]),
-        "next.reward": torch.tensor([[f[3] for f in row] for row in rows]),
+        "action": torch.tensor([[[f[1][name] for name in ACTION_NAMES] for f in row] for row in rows]),
+        "next.reward": torch.tensor([[f[2] for f in row] for row in rows]),
         f"{IMAGE_KEY}_is_pad": torch.tensor([[index >= len(episode) for index in row] for row in wanted]),
     }
 
@@ -322,11 +326,9 @@ def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> di
 def make_episode(draw, *outcomes: str) -> list[Frame]:
     """An episode of drives (d), failed attempts (f), successes (s) and placements (p), each with its own picture."""
     actions = {"d": DRIVE, "f": grasp_cell(40), "s": grasp_cell(112), "p": action_dict(Skill.PLACE)}
-    state = [0.0] * (len(STATE_NAMES) - 2)
     return [
         (
             draw(100 + index, color=(0, 18 + 5 * index, 0)),
-            [0.1 * index, 9.0 * index, *state],
             actions[outcome],
             float(outcome == "s"),
         )
@@ -339,14 +341,14 @@ def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, succes
     pictures = torch.cat([policy.to_pictures(episode[frame][0]) for frame in (0, after)])
     chance = 0.0 if success else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
     observations = policy.observer(pictures, policy.grasping)
-    motions = to_motions(torch.tensor([episode[frame][1] for frame in (0, after)]))
+    unknown = torch.zeros(1, TRAIL_FEATURES)
     return NavigationBatch(
         observations[:1],
-        motions[:1],
+        unknown,
         from_navigation_steps(torch.tensor([list(DRIVE.values())])),
         torch.tensor([0.0 if success else chance - 1]),
         observations[1:],
-        motions[1:],
+        unknown,
         torch.tensor([0.0 if success else 1 - chance]),
     )
 

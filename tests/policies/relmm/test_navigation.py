@@ -11,10 +11,11 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 from relmm.policies.relmm.encoders import Encoder, FloorObserver, PictureObserver
 from relmm.policies.relmm.navigation import Actor, Navigation, NavigationBatch
+from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 SIZE = 5
 KINDS = ["floor", "paper_small"]
-Seen = tuple[Tensor, Tensor]  # an observation and the motion before it
+Seen = tuple[Tensor, Tensor]  # an observation and the trail to it
 MakeNavigation = Callable[..., Navigation]
 
 
@@ -27,12 +28,12 @@ class DoubleEncoder(nn.Module):
         if encoder.on_floor:
             self.keypoints, self.embed = encoder.keypoints, encoder.embed
 
-    def forward(self, observations: Tensor, motions: Tensor) -> Tensor:
+    def forward(self, observations: Tensor, trails: Tensor) -> Tensor:
         scaled = observations.double() / 127.5 - 1
         encoded = self.layers(scaled)
         if not self.on_floor:
             return encoded
-        return torch.cat([encoded, self.embed(torch.cat([self.keypoints(scaled), motions], dim=1))], dim=1)
+        return torch.cat([encoded, self.embed(torch.cat([self.keypoints(scaled), trails], dim=1))], dim=1)
 
 
 @pytest.fixture
@@ -58,10 +59,11 @@ def make_batch(kind: str = "floor") -> NavigationBatch:
     rng = torch.Generator().manual_seed(1)
     shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
     observations, following = torch.randint(0, 256, (2, SIZE, *shape), dtype=torch.uint8, generator=rng)
-    actions, motions, next_motions = torch.rand(3, SIZE, 2, dtype=torch.double, generator=rng) * 2 - 1
+    actions = torch.rand(SIZE, 2, dtype=torch.double, generator=rng) * 2 - 1
+    trails, next_trails = torch.rand(2, SIZE, TRAIL_FEATURES, dtype=torch.double, generator=rng) * 2 - 1
     rewards = torch.tensor([-1.0, 0.0, -0.4, -1.0, -0.9], dtype=torch.double)
     continues = torch.tensor([1, 0, 0.6, 1, 1.0]).double()
-    return NavigationBatch(observations, motions, actions, rewards, following, next_motions, continues)
+    return NavigationBatch(observations, trails, actions, rewards, following, next_trails, continues)
 
 
 def make_noise() -> Tensor:
@@ -69,11 +71,11 @@ def make_noise() -> Tensor:
 
 
 def before(batch: NavigationBatch) -> Seen:
-    return batch.observations, batch.motions
+    return batch.observations, batch.trails
 
 
 def after(batch: NavigationBatch) -> Seen:
-    return batch.next_observations, batch.next_motions
+    return batch.next_observations, batch.next_trails
 
 
 # --- The same in other words ---------------------------------------------------------------------------------
@@ -276,10 +278,10 @@ def test_deviation_is_limited_for_the_floor_only(kind: str, expected: tuple[floa
 @pytest.mark.parametrize("kind", KINDS)
 def test_greedy_action_is_the_mean_and_sampled_ones_follow_the_actor(kind: str, make_navigation) -> None:
     navigation = make_navigation(kind)
-    observations, motions = (column[:1] for column in before(make_batch(kind)))
-    gaussian = policy_at(navigation, observations, motions).base_dist
-    assert torch.allclose(navigation.act(observations, motions, None), gaussian.loc.tanh())
-    many = observations.expand(200, -1, -1, -1), motions.expand(200, -1)
+    observations, trails = (column[:1] for column in before(make_batch(kind)))
+    gaussian = policy_at(navigation, observations, trails).base_dist
+    assert torch.allclose(navigation.act(observations, trails, None), gaussian.loc.tanh())
+    many = observations.expand(200, -1, -1, -1), trails.expand(200, -1)
     raw = navigation.act(*many, torch.Generator().manual_seed(0)).atanh()
     assert torch.allclose(raw.mean(dim=0), gaussian.loc[0], atol=4 * gaussian.scale.max().item() / math.sqrt(200))
     assert torch.allclose(raw.std(dim=0), gaussian.scale[0], rtol=0.2)
@@ -291,9 +293,11 @@ def test_mirrored_batch_exchanges_left_and_right_and_nothing_else() -> None:
     mirrored = batch.mirrored()
     assert torch.equal(mirrored.observations[..., 0], batch.observations[..., -1])
     assert torch.equal(mirrored.next_observations.flip(-1), batch.next_observations)
-    for name in ("actions", "motions", "next_motions"):
-        turned, straight = getattr(mirrored, name), getattr(batch, name)
-        assert torch.equal(turned[:, 0], straight[:, 0])
-        assert torch.equal(turned[:, 1], -straight[:, 1])
+    assert torch.equal(mirrored.actions[:, 0], batch.actions[:, 0])
+    assert torch.equal(mirrored.actions[:, 1], -batch.actions[:, 1])
+    for turned, straight in ((mirrored.trails, batch.trails), (mirrored.next_trails, batch.next_trails)):
+        assert torch.equal(turned[:, 0::3], straight[:, 0::3])
+        assert torch.equal(turned[:, 1::3], -straight[:, 1::3])
+        assert torch.equal(turned[:, 2::3], -straight[:, 2::3])
     assert mirrored.rewards is batch.rewards
     assert mirrored.continues is batch.continues
