@@ -50,6 +50,12 @@ def action_of() -> Callable[[Skill, int], list[float]]:
 
 
 @pytest.fixture(scope="session")
+def motion_of() -> Callable[[int], tuple[float, float]]:
+    """A motion, m/s and deg/s, that tells the number of its frame."""
+    return lambda number: (number % 500 / 500 * MAX_X_VEL, -number % 500 / 500 * MAX_THETA_VEL)
+
+
+@pytest.fixture(scope="session")
 def make_policy() -> Callable[..., ReLMMPolicy]:
     """Builds a policy with small networks."""
 

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
 import relmm.plugin  # noqa: F401
-from relmm.features import FPS, GRID, IMAGE_KEY, Phase, Skill, cell_to_xy
+from relmm.features import FPS, GRID, IMAGE_KEY, STATE_KEY, Phase, Skill, cell_to_xy
 from relmm.geometry import CAMERAS
 from relmm.learning.learner import Learner
 from relmm.learning.maps import to_pictures
@@ -32,7 +32,7 @@ MakeLearner = Callable[..., Learner]
 
 
 @pytest.fixture
-def make_learner(make_policy, numbered, action_of) -> MakeLearner:
+def make_learner(make_policy, numbered, motion_of, action_of) -> MakeLearner:
     """A learner of a life: episodes of drives (d, r in pseudo-resets), attempts (f, s) and placements (p)."""
 
     def make(life: str = "", capacity: int = 200, seed: int = 0, **settings: Any) -> Learner:
@@ -40,7 +40,8 @@ def make_learner(make_policy, numbered, action_of) -> MakeLearner:
         for episode in life.split():
             for kind in episode:
                 phase = Phase.PSEUDO_RESET if kind == "r" else Phase.LEARNING
-                replay.add(numbered(replay.frames), action_of(SKILLS[kind], replay.frames), kind == "s", phase)
+                number = replay.frames
+                replay.add(numbered(number), motion_of(number), action_of(SKILLS[kind], number), kind == "s", phase)
             replay.save_episode()
         return Learner(make_policy(**{**SMALL, **settings}), replay, seed)
 
@@ -149,6 +150,8 @@ def test_navigation_batch_is_that_of_its_frames(relabel: bool, make_learner, num
         chance = 0.0 if success or not relabel else chance
         assert (batch.observations[row].int() - observations[0]).abs().max() <= 1
         assert (batch.next_observations[row].int() - observations[1]).abs().max() <= 1
+        trails = learner.replay.trails(np.array([frame, after]))
+        assert np.array_equal(torch.stack([batch.trails[row], batch.next_trails[row]]), trails)
         assert batch.rewards[row].item() == pytest.approx(float(success) - 1 + chance, abs=1e-5)
         assert batch.continues[row].item() == pytest.approx(1 - float(success) - chance * (not success), abs=1e-5)
         assert batch.actions[row].tolist() == pytest.approx([2 * frame / 1000 - 1, frame / 1000], abs=1e-6)
@@ -188,17 +191,19 @@ def test_batches_are_mirrored_now_and_then(mirror: bool, expected: set[bool], ma
 @dataclass
 class Episode:
     images: NDArray[np.uint8]
+    states: NDArray[np.float32]
     actions: NDArray[np.float32]
     rewards: NDArray[np.float32]
     phases: NDArray[np.int64]
 
 
 @pytest.fixture
-def recorded(numbered, action_of) -> Callable[[str], Episode]:
+def recorded(numbered, motion_of, action_of) -> Callable[[str], Episode]:
     def episode(kinds: str, phase: Phase = Phase.LEARNING) -> Episode:
         phases = [Phase.PSEUDO_RESET if kind == "r" else phase for kind in kinds]
         return Episode(
             np.stack([numbered(index) for index in range(len(kinds))]),
+            np.array([[*motion_of(index), *[0.0] * 8] for index in range(len(kinds))], np.float32),
             np.array([action_of(SKILLS[kind], index) for index, kind in enumerate(kinds)], np.float32),
             np.array([kind == "s" for kind in kinds], np.float32),
             np.array(phases),
@@ -216,6 +221,8 @@ def test_recorded_episode_fills_the_replay_as_living_it_does(make_learner, recor
         rows = np.arange(len(read))
         for name, column in read.rows(rows).items():
             assert column == pytest.approx(wanted.rows(rows)[name], abs=1e-6)
+    frames = np.arange(7)
+    assert learner.replay.trails(frames) == pytest.approx(lived.replay.trails(frames), abs=1e-6)
     assert (learner.replay.frames, learner.replay.episodes) == (7, 1)
     assert learner.logs == {}
 
@@ -242,7 +249,7 @@ def test_frozen_ensemble_learns_from_recorded_curricula_only(make_learner, recor
 
 
 def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> None:
-    """LeRobot's dataset, batches and preprocessor against the replay, on recorded episodes."""
+    """LeRobot's dataset, batches and preprocessor against the replay, but for the trails that single frames lack."""
     policy = make_policy(refreshed_maps=0, seed=2)
     deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
     columns = dict.fromkeys((IMAGE_KEY, "action", "next.reward"), deltas)
@@ -254,7 +261,8 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
         episode = frame["episode_index"]
         picture = (frame[IMAGE_KEY][0] * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
         phase = int(frame["complementary_info.phase"])
-        learner.replay.add(picture, frame["action"][0], bool(frame["next.reward"][0] > 0), phase)
+        motion, success = frame[STATE_KEY][:2].tolist(), bool(frame["next.reward"][0] > 0)
+        learner.replay.add(picture, motion, frame["action"][0], success, phase)
     learner.replay.save_episode()
     policy.eval()
 
@@ -267,6 +275,8 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
     rows = {name: np.concatenate([part[name] for part in every]) for name in every[0]}
     order = np.argsort(rows["frame"])
     steps = learner.navigation_batch({name: column[order] for name, column in rows.items()})
+    assert steps.trails.any()
+    steps = replace(steps, trails=torch.zeros_like(steps.trails), next_trails=torch.zeros_like(steps.trails))
     torch.manual_seed(3)
     navigation_loss, wanted = policy.navigation.loss(steps, torch.randn(2, len(order), 2))
     pictures = to_pictures(replay.pictures(replay.attempts["frame"]), torch.device("cpu"))
@@ -300,7 +310,7 @@ def test_ensemble_learns_to_grasp_what_is_bright(make_policy) -> None:
         cell = int(rng.integers(GRID**2))
         attempt = int(rng.integers(GRID**2)) if rng.random() < 0.7 else cell
         action = list(grasp_cell(attempt).values())
-        learner.replay.add(scene(rng, cell), action, distance(cell, attempt) <= 1, Phase.LEARNING)
+        learner.replay.add(scene(rng, cell), (0.0, 0.0), action, distance(cell, attempt) <= 1, Phase.LEARNING)
     losses = []
     for _ in range(150):
         learner.update_grasping()

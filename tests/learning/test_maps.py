@@ -34,7 +34,7 @@ def maps(policy: ReLMMPolicy, replay: Replay) -> Maps:
 
 def add(replay: Replay, count: int, numbered, action_of) -> None:
     for _ in range(count):
-        replay.add(numbered(replay.frames), action_of(Skill.NAVIGATE, 0), False, Phase.LEARNING)
+        replay.add(numbered(replay.frames), (0.0, 0.0), action_of(Skill.NAVIGATE, 0), False, Phase.LEARNING)
 
 
 def fresh(policy: ReLMMPolicy, replay: Replay, frames: np.ndarray) -> tuple[Tensor, Tensor]:

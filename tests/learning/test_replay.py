@@ -9,6 +9,7 @@ import pytest
 from relmm.features import FRONT, GRID, MAX_THETA_VEL, MAX_X_VEL, Phase, Skill, action_dict
 from relmm.learning.replay import Replay, Table
 from relmm.policies.controller import grasp_cell
+from relmm.policies.relmm.trail import Trail
 
 # Episodes of drives (d), drives of pseudo-resets (r), attempts that fail (f) or do not (s), and placements (p).
 Life = list[str]
@@ -17,7 +18,7 @@ Fill = Callable[..., Replay]
 
 
 @pytest.fixture
-def fill(numbered, action_of) -> Fill:
+def fill(numbered, motion_of, action_of) -> Fill:
     """A replay of a life, frame by frame."""
 
     def replay_of(life: Life, capacity: int = 500) -> Replay:
@@ -26,7 +27,7 @@ def fill(numbered, action_of) -> Fill:
             for kind in episode:
                 phase = Phase.PSEUDO_RESET if kind == "r" else Phase.LEARNING
                 number = replay.frames
-                replay.add(numbered(number), action_of(SKILLS[kind], number), kind == "s", phase)
+                replay.add(numbered(number), motion_of(number), action_of(SKILLS[kind], number), kind == "s", phase)
             replay.save_episode()
         return replay
 
@@ -74,6 +75,20 @@ def steps_of(life: Life, kind: str) -> list[Step]:
                 steps.append(Step(start + index, start + outcome[0], outcome[1]))
         start += len(episode)
     return steps
+
+
+def trails_of(life: Life, motion_of) -> np.ndarray:
+    """Of each frame, slowly: the drives before it in its episode, with the motions that the frames after them saw."""
+    trails, start = [], 0
+    for episode in life:
+        for index in range(len(episode)):
+            trail = Trail()
+            for earlier in range(index):
+                if episode[earlier] in "dr":
+                    trail.moved(*motion_of(start + earlier + 1))
+            trails.append(trail.features())
+        start += len(episode)
+    return np.array(trails)
 
 
 def rows_of(table: Table) -> list[Step]:
@@ -134,11 +149,28 @@ def test_actions_and_pictures_are_those_of_their_frames(seed: int, fill: Fill, n
             assert [number_of(image) for image in replay.pictures(table[column])] == table[column].tolist()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_trails_hold_the_drives_of_their_episode(seed: int, fill: Fill, motion_of) -> None:
+    life = random_life(seed)
+    replay = fill(life)
+    assert replay.trails(np.arange(replay.frames)) == pytest.approx(trails_of(life, motion_of), abs=1e-6)
+
+
+def test_next_trail_is_that_of_the_frame_to_come(numbered, action_of) -> None:
+    replay = Replay(10)
+    for kind in "dfdd":
+        motion = (0.1 + 0.01 * replay.frames, 20.0)
+        expected = replay.next_trail(motion)
+        assert np.array_equal(replay.next_trail(motion), expected), "to ask changes nothing"
+        replay.add(numbered(0), motion, action_of(SKILLS[kind], 0), False, Phase.LEARNING)
+        assert np.array_equal(replay.trails(np.array([replay.frames - 1]))[0], expected)
+
+
 def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> None:
     replay = Replay(10)
     lengths = []
     for kind in "dffd":
-        replay.add(numbered(0), action_of(SKILLS[kind], 0), False, Phase.LEARNING)
+        replay.add(numbered(0), (0.0, 0.0), action_of(SKILLS[kind], 0), False, Phase.LEARNING)
         lengths.append(len(replay.steps))
     assert lengths == [0, 0, 0, 1]
 
@@ -164,19 +196,23 @@ def test_frames_are_taken_as_recorders_take_them(numbered) -> None:
     drive = action_dict(x_vel=MAX_X_VEL, theta_vel=-MAX_THETA_VEL / 2)
     for number, (action, reward) in enumerate([(drive, 0.0), (grasp_cell(17), 1.0)]):
         outcome = {"next.reward": reward, "complementary_info.phase": int(Phase.LEARNING)}
-        replay.add_frame({FRONT: numbered(number)}, action, outcome, "task")
+        observation = {FRONT: numbered(number), "x.vel": number * MAX_X_VEL, "theta.vel": 0.5 * MAX_THETA_VEL}
+        replay.add_frame(observation, action, outcome, "task")
     replay.save_episode()
     assert {name: values.tolist() for name, values in replay.steps.rows(np.array([0])).items()} == {
         "frame": [0], "next": [1], "forward": [1.0], "turn": [-0.5], "success": [True]
     }  # fmt: skip
     assert replay.attempts["cell"].tolist() == [17]
+    driven = Trail()
+    driven.moved(MAX_X_VEL, 0.5 * MAX_THETA_VEL)
+    assert np.array_equal(replay.trails(np.array([0, 1])), [Trail().features(), driven.features()])
     assert np.array_equal(replay.pictures(np.array([1]))[0], numbered(1))
 
 
 # --- Ring ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("capacity", [5, 17, 60])
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_sampled_still_has_its_pictures(capacity: int, seed: int, fill: Fill, number_of) -> None:
+def test_what_is_sampled_still_has_its_pictures(capacity: int, seed: int, fill: Fill, number_of, motion_of) -> None:
     life = random_life(seed)
     life.append("drdffs")  # so that each table has rows
     replay = fill(life, capacity)
@@ -189,6 +225,7 @@ def test_what_is_sampled_still_has_its_pictures(capacity: int, seed: int, fill: 
         assert [number_of(image) for image in replay.pictures(frames)] == frames.tolist()
     after = replay.steps["next"][replay.sample(replay.steps, 50, rng)]
     assert [number_of(image) for image in replay.pictures(after)] == after.tolist()
+    assert replay.trails(after) == pytest.approx(trails_of(life, motion_of)[after], abs=1e-6)
 
 
 def test_rows_are_sampled_uniformly(fill: Fill) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from relmm.features import FRONT, GRID, Phase, Skill, action_dict, in_grasp_area, xy_to_cell
+from relmm.features import FRONT, GRID, STATE_NAMES, Phase, Skill, action_dict, in_grasp_area, xy_to_cell
 from relmm.learning.life import Life
 from relmm.learning.progress import Progress
 from relmm.learning.trainer import Trainer
@@ -40,6 +40,7 @@ class World:
     events: list[Event] = field(default_factory=list)
     actions: list[dict[str, float]] = field(default_factory=list)
     holding: bool = False
+    stuck: bool = False  # whether nothing can be put down: something is in the way
 
     def __post_init__(self) -> None:
         self._successes, self._wishes = (np.random.default_rng([self.seed, which]) for which in (0, 1))
@@ -56,13 +57,14 @@ class World:
 
     def place(self, phase: Phase) -> None:
         self.events.append(("place", phase))
-        self.holding = False
+        self.holding = self.holding and self.stuck
 
     # --- As a robot -----------------------------------------------------------------------------------------
     phase = Phase.LEARNING  # of the action to come
 
     def get_observation(self) -> dict[str, Any]:
-        return {FRONT: np.full((2, 2, 3), 255 * self.grasp_wanted, np.uint8), "holding.pos": float(self.holding)}
+        picture = np.full((2, 2, 3), 255 * self.grasp_wanted, np.uint8)
+        return {**dict.fromkeys(STATE_NAMES, 0.5), "holding.pos": float(self.holding), FRONT: picture}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         self.actions.append(action)
@@ -97,7 +99,7 @@ class FakePolicy:
     def look(self, image: np.ndarray) -> None:
         self.grasp_probability = 1.0 if image.max() else self.floor_probability
 
-    def navigate(self, image: np.ndarray) -> dict[str, float]:
+    def navigate(self, image: np.ndarray, trail: np.ndarray) -> dict[str, float]:
         return POLICY_DRIVE
 
 
@@ -106,7 +108,7 @@ class FakeLearner:
 
     def __init__(self, world: World, min_attempts: int) -> None:
         self._world, self._min_attempts = world, min_attempts
-        self.replay = SimpleNamespace(attempts=[])
+        self.replay = SimpleNamespace(attempts=[], next_trail=lambda motion: np.array(motion))
 
     @property
     def grasping_has_begun(self) -> bool:
@@ -344,6 +346,36 @@ def test_interventions_are_counted_and_seen(make_run: MakeRun) -> None:
 def test_no_curriculum_is_stationary_by_itself(make_run: MakeRun) -> None:
     for curriculum in ("none", "autonomous"):
         assert not make_run(World(0), curriculum).trainer.in_stationary_curriculum
+
+
+# --- Placements that fail -------------------------------------------------------------------------------------
+def test_stationary_curriculum_tries_to_drop_again_before_it_goes_on(make_run: MakeRun) -> None:
+    run = make_run(World(0, success=1.0), "stationary")
+    run.trainer.stationary_attempt()
+    run.world.stuck = True
+    for _ in range(3):
+        run.trainer.stationary_attempt()
+    run.world.stuck = False
+    run.trainer.stationary_attempt()
+    assert run.world.events == [PRACTICE, LEARN_GRASP, *[DROP] * 4, PRACTICE, LEARN_GRASP]
+
+
+def test_practice_ends_where_nothing_can_be_dropped_and_the_next_step_carries_it_away(make_run: MakeRun) -> None:
+    run = make_run(World(0, success=1.0), "autonomous", num_stop=5, num_max=1000)
+    run.world.stuck = True
+    run.trainer.navigation_step()
+    paper = World(0, success=1.0, stuck=True)
+    paper.events = [DRIVE, PRACTICE, LEARN_GRASP, DROP, LEARN_DRIVE]
+    paper.holding = True
+    pseudo_reset(paper)
+    assert run.world.events == paper.events
+    assert run.progress.attempts == 1
+    run.world.stuck = paper.stuck = False
+    before = len(run.world.events)
+    run.trainer.navigation_step()
+    paper.events = []
+    pseudo_reset(paper)
+    assert run.world.events[before:][: len(paper.events) + 1] == [*paper.events, DRIVE]
 
 
 # --- Stopping ------------------------------------------------------------------------------------------------

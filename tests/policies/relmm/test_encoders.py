@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -30,10 +28,6 @@ def observer(make_config) -> FloorObserver:
     return FloorObserver(make_config())
 
 
-def no_trails(count: int) -> torch.Tensor:
-    return torch.zeros(count, TRAIL_FEATURES)
-
-
 def to_images(picture: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
 
@@ -42,8 +36,7 @@ def to_images(picture: np.ndarray) -> torch.Tensor:
 def test_map_agrees_with_the_grasp_cells_where_the_arm_reaches(observer, ensemble, noise_pictures) -> None:
     """The map is drawn by the first two members; a pixel shows the best of its 5x5 cells."""
     images = noise_pictures(2)
-    chances = ensemble.logits(images)[:2].mean(dim=0).sigmoid()
-    cells = chances.reshape(2, GRID // PIXEL, PIXEL, GRID // PIXEL, PIXEL)
+    cells = ensemble.logits(images)[:2].mean(dim=0).sigmoid().reshape(2, GRID // PIXEL, PIXEL, GRID // PIXEL, PIXEL)
     drawn = observer(images, ensemble)[:, 0][:, *REACH]
     assert (drawn.float() - cells.amax(dim=(2, 4)) * 255).abs().max() <= 1
 
@@ -110,7 +103,7 @@ def test_observation_and_features_have_the_promised_shapes(kind: str, make_confi
     assert observations.dtype == torch.uint8
     assert observations.shape == (2, *observer.shape)
     encoder = Encoder(kind)
-    assert encoder(observations, no_trails(2)).shape == (2, encoder.features)
+    assert encoder(observations, torch.zeros(2, TRAIL_FEATURES)).shape == (2, encoder.features)
 
 
 def test_paper_encoder_is_that_of_the_authors() -> None:
@@ -128,84 +121,46 @@ def test_encoder_scales_its_input_to_plus_and_minus_1() -> None:
     encoder = Encoder("floor")
     seen: list[torch.Tensor] = []
     encoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    encoder(torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 4, 32, 33), no_trails(2))
+    encoder(
+        torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 4, 32, 33),
+        torch.zeros(2, TRAIL_FEATURES),
+    )
     assert [float(values.min()) for values in seen[0]] == [float(values.max()) for values in seen[0]] == [-1.0, 1.0]
 
 
-@pytest.mark.parametrize(("kind", "matters"), [("floor", True), ("paper", False), ("paper_small", False)])
-def test_trail_matters_beside_a_map_of_the_floor_only(kind: str, matters: bool) -> None:
-    encoder = Encoder(kind)
+@pytest.mark.parametrize(("kind", "used"), [("floor", True), ("paper", False), ("paper_small", False)])
+def test_trail_is_a_feature_of_the_floor_only(kind: str, used: bool) -> None:
+    """The paper's navigation sees the picture alone."""
+    torch.manual_seed(0)
     shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
-    observations = torch.zeros(1, *shape, dtype=torch.uint8)
-    here, moved = (encoder(observations, trails) for trails in (no_trails(1), no_trails(1) + 1))
-    assert torch.equal(here, moved) != matters
+    observations, encoder = torch.zeros(1, *shape, dtype=torch.uint8), Encoder(kind)
+    left, right = (encoder(observations, torch.full((1, TRAIL_FEATURES), side)) for side in (1.0, -1.0))
+    assert torch.equal(left, right) != used
 
 
 # --- Keypoints -----------------------------------------------------------------------------------------------
-def points_of(keypoints: Keypoints, maps: torch.Tensor) -> torch.Tensor:
-    """x, y and graspability of the point that each head finds in one map, (heads, 3)."""
-    with torch.no_grad():
-        return keypoints(maps[None]).reshape(-1, 3)
-
-
-def map_of(*pixels: tuple[int, int]) -> torch.Tensor:
-    """A grey map with nothing to grasp but at these pixels, -1..1."""
-    maps = torch.zeros(FloorObserver.shape)
-    maps[0] = -1.0
+def keypoints(*pixels: tuple[int, int]) -> torch.Tensor:
+    """What fresh keypoints, (x, y, graspability) by head, make of a map with graspable pixels; (heads, 3)."""
+    torch.manual_seed(0)
+    maps = torch.full((1, *FloorObserver.shape), -1.0)
     for row, column in pixels:
-        maps[0, row, column] = 1.0
-    return maps
+        maps[0, 0, row, column] = 1.0
+    return Keypoints()(maps).detach().reshape(-1, 3)
 
 
-def pixel_at(x: float, y: float) -> tuple[int, int]:
-    """The pixel of the map that shows a point of the floor (m, robot frame)."""
-    size_x, size_y = ((high - low) / GRID * PIXEL for low, high in (GRASP_X, GRASP_Y))
-    return math.floor((x - GRASP_X[0]) / size_x) + 1, math.floor((y - GRASP_Y[0]) / size_y) + 15
+@pytest.mark.parametrize("pixel", [(2, 16), (8, 10), (15, 25), (1, 15)])
+def test_keypoints_tell_where_a_graspable_thing_lies(pixel: tuple[int, int]) -> None:
+    """In m from the middle of the grasp area, forward and left; a pixel is five cells."""
+    place = [(pixel[0] - 2) * (GRASP_X[1] - GRASP_X[0]) / 3, (pixel[1] - 16) * (GRASP_Y[1] - GRASP_Y[0]) / 3]
+    farsighted = keypoints(pixel)[-1]
+    assert farsighted[:2].tolist() == pytest.approx(place, abs=0.03)
+    assert farsighted[2] > 0.9
 
 
-@pytest.mark.parametrize(("x", "y"), [(0.38, 0.0), (0.38, 0.05), (0.44, -0.05), (0.5, 0.1)])
-def test_every_head_finds_the_only_graspable_pixel_nearby(x: float, y: float) -> None:
-    middle = sum(GRASP_X) / 2
-    for found_x, found_y, graspable in points_of(Keypoints(), map_of(pixel_at(x, y))).tolist():
-        assert found_x == pytest.approx(x - middle, abs=0.04)
-        assert found_y == pytest.approx(y, abs=0.04)
-        assert graspable > 0.8
-
-
-@pytest.mark.parametrize(("x", "y"), [(0.6, 0.3), (0.9, -0.4), (1.3, 0.0), (1.2, 0.7)])
-def test_farsighted_head_finds_the_only_graspable_pixel_farther_off(x: float, y: float) -> None:
-    found_x, found_y, graspable = points_of(Keypoints(), map_of(pixel_at(x, y)))[-1].tolist()
-    assert found_x == pytest.approx(x - sum(GRASP_X) / 2, abs=0.08)
-    assert found_y == pytest.approx(y, abs=0.08)
-    assert graspable > 0.8
-
-
-def test_nearer_of_two_graspable_pixels_is_preferred() -> None:
-    """The more, the shorter a head's sight."""
-    near, far = pixel_at(0.45, 0.1), pixel_at(1.3, -0.4)
-    left = points_of(Keypoints(), map_of(near, far))[:, 1]
-    assert left[:2].tolist() == pytest.approx([0.108] * 2, abs=0.01)
-    assert (left[:-1] > left[1:]).all()
-    assert left[-1] > (0.1 - 0.4) / 2, "nearer to the near one than to the far one"
-
-
-def test_point_is_a_mean_of_places_on_the_map() -> None:
-    keypoints = Keypoints()
-    maps = torch.rand(5, *FloorObserver.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    places = keypoints.places
-    for found in (points_of(keypoints, each) for each in maps):
-        assert ((found[:, :2] >= places.amin(dim=1)) & (found[:, :2] <= places.amax(dim=1))).all()
-        assert (found[:, 2].abs() <= 1).all()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_fresh_keypoints_of_a_mirrored_map_are_mirrored(seed: int) -> None:
-    torch.manual_seed(seed)
-    keypoints, maps = Keypoints(), torch.rand(FloorObserver.shape) * 2 - 1
-    seen, mirrored = points_of(keypoints, maps), points_of(keypoints, maps.flip(-1))
-    assert torch.allclose(mirrored, seen * torch.tensor([1.0, -1.0, 1.0]), atol=1e-5)
-    assert seen[:, 1].abs().max() > 1e-3
-
-
-def test_places_are_not_saved_but_what_is_preferred_is() -> None:
-    assert set(Keypoints().state_dict()) == {"look.weight", "prefer"}
+def test_keypoints_prefer_the_nearest_thing() -> None:
+    """The near-sighted ones see it alone; the others, ever less, lean to it."""
+    near, far, both = keypoints((4, 12)), keypoints((18, 24)), keypoints((4, 12), (18, 24))
+    to_near, to_far = ((both - one)[:, :2].norm(dim=1) for one in (near, far))
+    assert to_near[:2].max() < 0.02
+    assert (to_near.diff() > 0).all()
+    assert (to_near < to_far).all()

@@ -22,7 +22,6 @@ from relmm.features import (
     MAX_THETA_VEL,
     MAX_X_VEL,
     STATE_KEY,
-    STATE_NAMES,
     Skill,
     action_dict,
     cell_to_xy,
@@ -197,73 +196,6 @@ def test_probability_is_unknown_before_the_first_picture(certain: MakePolicy) ->
     assert certain(0.5).grasp_probability == -1.0
 
 
-# --- Trail ---------------------------------------------------------------------------------------------------
-@pytest.fixture
-def trails_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[ReLMMPolicy], list[NDArray[np.float32]]]:
-    """Notes the trails with which a policy navigates from now on."""
-
-    def noted(policy: ReLMMPolicy) -> list[NDArray[np.float32]]:
-        trails: list[NDArray[np.float32]] = []
-        original = policy.navigate
-
-        def navigate(pictures: Tensor, trail: NDArray[np.float32]) -> dict[str, float]:
-            trails.append(trail.copy())
-            return original(pictures, trail)
-
-        monkeypatch.setattr(policy, "navigate", navigate)
-        return trails
-
-    return noted
-
-
-def moving(batch: dict[str, Tensor], *motions: tuple[float, float]) -> dict[str, Tensor]:
-    """The batch with these base velocities, m/s and deg/s, a row each."""
-    state = batch[STATE_KEY].clone()
-    state[:, [STATE_NAMES.index("x.vel"), STATE_NAMES.index("theta.vel")]] = torch.tensor(motions)
-    return {**batch, STATE_KEY: state}
-
-
-def test_navigation_hears_where_the_robot_has_been(green: ReLMMPolicy, make_batch, trails_of, draw, empty) -> None:
-    """Of each observation's motion, if a navigation step led to it; grasps leave the last one standing there."""
-    trails, wanted = trails_of(green), Trail()
-    expected = []
-    script = [(empty, 0), (empty, 1), (draw(112), 2), (draw(112), 2), (empty, 2), (draw(112), 3), (empty, 3)]
-    motions = [(0.4, 10.0), (0.1, -50.0), (0.2, 90.0), (0.3, 20.0)]  # that of the first observation led nowhere
-    drove = False
-    for image, number in script:
-        action = green.select_action(moving(make_batch(image), motions[number]))[0]
-        if drove:
-            wanted.moved(*motions[number])
-        drove = action[2] == Skill.NAVIGATE
-        if drove:
-            expected.append(wanted.features())
-    assert len(expected) == 4, "the attempts are none of them"
-    assert np.array(trails) == pytest.approx(np.array(expected), abs=1e-6)
-    assert not trails[0].any()
-
-
-def test_each_robot_has_its_own_trail_and_a_new_one_in_a_new_episode(
-    green: ReLMMPolicy, make_batch, trails_of, empty
-) -> None:
-    trails, batch = trails_of(green), make_batch(empty, empty)
-    green.select_action(moving(batch, (0.0, 0.0), (0.0, 0.0)))
-    green.select_action(moving(batch, (0.1, 0.0), (0.3, -90.0)))
-    green.reset()
-    green.select_action(moving(batch, (0.1, 0.0), (0.3, -90.0)))
-    wanted = [Trail() for _ in range(6)]
-    wanted[2].moved(0.1, 0.0)
-    wanted[3].moved(0.3, -90.0)
-    assert np.array(trails) == pytest.approx(np.array([each.features() for each in wanted]), abs=1e-6)
-
-
-def test_trail_changes_where_the_policy_drives(green: ReLMMPolicy, empty) -> None:
-    pictures, trail = green.to_pictures(empty), Trail()
-    fresh = green.navigate(pictures, trail.features())
-    for _ in range(5):
-        trail.moved(0.0, MAX_THETA_VEL)
-    assert green.navigate(pictures, trail.features()) != fresh
-
-
 # --- Actions -------------------------------------------------------------------------------------------------
 def test_navigation_actions_convert_there_and_back() -> None:
     actions = torch.tensor([[-1.0, -1.0], [-1.0, 0.0], [0.0, 0.5], [1.0, 1.0], [0.3, -0.7]])
@@ -277,6 +209,25 @@ def test_navigation_steps_beyond_the_range_are_clipped() -> None:
     """A robot that bumped drives backwards."""
     steps = torch.tensor([[-0.2, 200.0, 0, 0, 0], [0.9, -200.0, 0, 0, 0]])
     assert from_navigation_steps(steps).tolist() == [[-1.0, 1.0], [1.0, -1.0]]
+
+
+def test_policy_remembers_its_trail_from_the_drives_it_asked_for(make_policy_of, make_batch, empty) -> None:
+    """A step's velocities are in the state after it; attempts and placements are no steps."""
+    policy, given = make_policy_of(seed=1, grasp_threshold=1.0), []
+    navigate = policy.navigate
+    policy.navigate = lambda pictures, trail: (given.append(trail), navigate(pictures, trail))[1]
+    driven, batch, expected = [(0.1, 30.0), (0.2, -60.0), (0.0, 90.0)], make_batch(empty), Trail()
+    policy.select_action(batch)
+    assert np.array_equal(given[-1], expected.features()), "what came before the first step is unknown"
+    for motion in driven:
+        batch[STATE_KEY][0, :2] = torch.tensor(motion)
+        policy.select_action(make_batch(empty, holding=(0,)))
+        policy.select_action(batch)
+        expected.moved(*motion)
+        assert given[-1] == pytest.approx(expected.features(), abs=1e-6)
+    policy.reset()
+    policy.select_action(batch)
+    assert np.array_equal(given[-1], Trail().features())
 
 
 # --- Seeds, files and LeRobot --------------------------------------------------------------------------------
@@ -315,13 +266,14 @@ def test_lerobot_makes_it_for_the_room(make_batch, empty) -> None:
     assert action.shape == (1, len(ACTION_NAMES))
 
 
-def test_optimiser_gets_every_weight_that_is_trained_once(make_policy_of: MakePolicy) -> None:
+def test_optimiser_gets_every_weight_but_the_targets_once(make_policy_of: MakePolicy) -> None:
     policy = make_policy_of(grasp_learning_rate=0.01, navigation_learning_rate=0.02)
     groups = policy.get_optim_params()
-    given = [id(weight) for group in groups for weight in group["params"]]
-    assert len(given) == len(set(given))
-    assert set(given) == {id(weight) for weight in policy.parameters() if weight.requires_grad}
-    assert not set(given) & {id(weight) for weight in policy.navigation.targets.parameters()}
+    given = [weight for group in groups for weight in group["params"]]
+    targets = list(policy.navigation.targets.parameters())
+    assert (
+        len({id(weight) for weight in [*given, *targets]}) == len(given) + len(targets) == len([*policy.parameters()])
+    )
     assert [group["lr"] for group in groups] == [0.01, 0.02]
 
 
@@ -340,8 +292,8 @@ def test_steps_without_success_are_rewarded_with_the_grasp_probability(
     policy = make_policy_of("dense", relabel=relabel, relabel_terminal=terminal)
     pictures = torch.zeros(3, 1, 1, 1, dtype=torch.uint8)
     success = torch.tensor([0.0, 0.0, 1.0])
-    trails = torch.zeros(3, TRAIL_FEATURES)
-    batch = NavigationBatch(pictures, trails, torch.zeros(3, 2), success - 1, pictures, trails, 1 - success)
+    still, trails = torch.zeros(3, 2), torch.zeros(3, TRAIL_FEATURES)
+    batch = NavigationBatch(pictures, trails, still, success - 1, pictures, trails, 1 - success)
     result = policy.relabel(batch, torch.tensor([0.3, 0.0, 0.9]), success < 0.5)
     assert result.rewards.tolist() == pytest.approx(rewards)
     assert result.continues.tolist() == pytest.approx(continues)
@@ -355,7 +307,7 @@ LAST_NOT_FIRST = pytest.mark.xfail(
 TOO_SHORT = pytest.mark.xfail(
     strict=True, reason="forward sees num_grasp + 1 frames after a drive, but the attempts of a curriculum go on"
 )
-Frame = tuple[NDArray[np.uint8], dict[str, float], float]
+Frame = tuple[NDArray[np.uint8], dict[str, float], float]  # picture, action, reward
 DRIVE = action_dict(x_vel=0.3, theta_vel=-40.0)
 
 
@@ -375,7 +327,11 @@ def make_episode(draw, *outcomes: str) -> list[Frame]:
     """An episode of drives (d), failed attempts (f), successes (s) and placements (p), each with its own picture."""
     actions = {"d": DRIVE, "f": grasp_cell(40), "s": grasp_cell(112), "p": action_dict(Skill.PLACE)}
     return [
-        (draw(100 + index, color=(0, 18 + 5 * index, 0)), actions[outcome], float(outcome == "s"))
+        (
+            draw(100 + index, color=(0, 18 + 5 * index, 0)),
+            actions[outcome],
+            float(outcome == "s"),
+        )
         for index, outcome in enumerate(outcomes)
     ]
 
@@ -384,14 +340,15 @@ def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, succes
     """The transition of the drive in frame 0."""
     pictures = torch.cat([policy.to_pictures(episode[frame][0]) for frame in (0, after)])
     chance = 0.0 if success else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
-    observations, no_trail = policy.observer(pictures, policy.grasping), torch.zeros(1, TRAIL_FEATURES)
+    observations = policy.observer(pictures, policy.grasping)
+    unknown = torch.zeros(1, TRAIL_FEATURES)
     return NavigationBatch(
         observations[:1],
-        no_trail,
+        unknown,
         from_navigation_steps(torch.tensor([list(DRIVE.values())])),
         torch.tensor([0.0 if success else chance - 1]),
         observations[1:],
-        no_trail,
+        unknown,
         torch.tensor([0.0 if success else 1 - chance]),
     )
 

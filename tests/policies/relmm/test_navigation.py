@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -12,28 +11,29 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 from relmm.policies.relmm.encoders import Encoder, FloorObserver, PictureObserver
 from relmm.policies.relmm.navigation import Actor, Navigation, NavigationBatch
-from relmm.policies.relmm.trail import MIRROR, TRAIL_FEATURES
+from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 SIZE = 5
 KINDS = ["floor", "paper_small"]
+Seen = tuple[Tensor, Tensor]  # an observation and the trail to it
 MakeNavigation = Callable[..., Navigation]
-Seen = tuple[Tensor, Tensor]  # observations and trails
 
 
-class DoubleEncoder(Encoder):
+class DoubleEncoder(nn.Module):
     """The layers of an encoder, in double precision."""
 
     def __init__(self, encoder: Encoder) -> None:
-        nn.Module.__init__(self)
-        self.layers, self.on_floor, self.features = encoder.layers, encoder.on_floor, encoder.features
-        if self.on_floor:
+        super().__init__()
+        self.layers, self.on_floor = encoder.layers, encoder.on_floor
+        if encoder.on_floor:
             self.keypoints, self.embed = encoder.keypoints, encoder.embed
 
     def forward(self, observations: Tensor, trails: Tensor) -> Tensor:
         scaled = observations.double() / 127.5 - 1
+        encoded = self.layers(scaled)
         if not self.on_floor:
-            return self.layers(scaled)
-        return torch.cat([self.layers(scaled), self.embed(torch.cat([self.keypoints(scaled), trails], dim=1))], dim=1)
+            return encoded
+        return torch.cat([encoded, self.embed(torch.cat([self.keypoints(scaled), trails], dim=1))], dim=1)
 
 
 @pytest.fixture
@@ -44,10 +44,10 @@ def make_navigation(make_config) -> MakeNavigation:
         torch.manual_seed(0)
         config = make_config("rectified" if kind == "floor" else "dense", **settings)
         navigation = Navigation(config).double()
-        for module in list(navigation.modules()):
-            for name, child in list(module.named_children()):
-                if isinstance(child, Encoder):
-                    setattr(module, name, DoubleEncoder(child))
+        for critics in (navigation.critics, navigation.targets):
+            critics.encoders = nn.ModuleList([DoubleEncoder(each) for each in critics.encoders])
+        if navigation.actor_encoder is not None:
+            navigation.actor_encoder = DoubleEncoder(navigation.actor_encoder)
         for target in navigation.targets.parameters():
             target += 0.1 * torch.randn_like(target)
         return navigation
@@ -60,26 +60,26 @@ def make_batch(kind: str = "floor") -> NavigationBatch:
     shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
     observations, following = torch.randint(0, 256, (2, SIZE, *shape), dtype=torch.uint8, generator=rng)
     actions = torch.rand(SIZE, 2, dtype=torch.double, generator=rng) * 2 - 1
+    trails, next_trails = torch.rand(2, SIZE, TRAIL_FEATURES, dtype=torch.double, generator=rng) * 2 - 1
     rewards = torch.tensor([-1.0, 0.0, -0.4, -1.0, -0.9], dtype=torch.double)
-    trails, next_trails = torch.randn(2, SIZE, TRAIL_FEATURES, dtype=torch.double, generator=rng)
     continues = torch.tensor([1, 0, 0.6, 1, 1.0]).double()
     return NavigationBatch(observations, trails, actions, rewards, following, next_trails, continues)
-
-
-def here(batch: NavigationBatch) -> Seen:
-    return batch.observations, batch.trails
-
-
-def next_to(batch: NavigationBatch) -> Seen:
-    return batch.next_observations, batch.next_trails
 
 
 def make_noise() -> Tensor:
     return torch.randn(2, SIZE, 2, dtype=torch.double, generator=torch.Generator().manual_seed(2))
 
 
+def before(batch: NavigationBatch) -> Seen:
+    return batch.observations, batch.trails
+
+
+def after(batch: NavigationBatch) -> Seen:
+    return batch.next_observations, batch.next_trails
+
+
 # --- The same in other words ---------------------------------------------------------------------------------
-def policy_at(navigation: Navigation, seen: Seen) -> Independent:
+def policy_at(navigation: Navigation, *seen: Tensor) -> Independent:
     """The actor's distribution before the tanh."""
     encoder = navigation.actor_encoder or navigation.critics.encoders[0]
     outputs = navigation.actor.net(encoder(*seen))
@@ -90,9 +90,9 @@ def policy_at(navigation: Navigation, seen: Seen) -> Independent:
 
 
 def act_at(navigation: Navigation, seen: Seen, noise: Tensor) -> tuple[Tensor, Tensor]:
-    before = policy_at(navigation, seen)
-    raw = before.base_dist.loc + before.base_dist.scale * noise
-    return raw.tanh(), before.log_prob(raw) - torch.log1p(-raw.tanh().square()).sum(dim=1)
+    gaussian = policy_at(navigation, *seen)
+    raw = gaussian.base_dist.loc + gaussian.base_dist.scale * noise
+    return raw.tanh(), gaussian.log_prob(raw) - torch.log1p(-raw.tanh().square()).sum(dim=1)
 
 
 def values_at(critics: Any, seen: Seen, actions: Tensor) -> list[Tensor]:
@@ -104,25 +104,25 @@ def values_at(critics: Any, seen: Seen, actions: Tensor) -> list[Tensor]:
 
 
 def targets_at(navigation: Navigation, batch: NavigationBatch, noise: Tensor) -> Tensor:
-    actions, log_density = act_at(navigation, next_to(batch), noise)
-    first, second = values_at(navigation.targets, next_to(batch), actions)
-    after = torch.minimum(first, second) - navigation.log_temperature.exp() * log_density
-    return batch.rewards + navigation.config.gamma * batch.continues * after
+    actions, log_density = act_at(navigation, after(batch), noise)
+    first, second = values_at(navigation.targets, after(batch), actions)
+    value = torch.minimum(first, second) - navigation.log_temperature.exp() * log_density
+    return batch.rewards + navigation.config.gamma * batch.continues * value
 
 
 def critic_loss(navigation: Navigation, batch: NavigationBatch, targets: Tensor) -> Tensor:
-    first, second = values_at(navigation.critics, here(batch), batch.actions)
+    first, second = values_at(navigation.critics, before(batch), batch.actions)
     return ((first - targets).square().mean() + (second - targets).square().mean()) / 2
 
 
 def actor_loss(navigation: Navigation, batch: NavigationBatch, noise: Tensor) -> Tensor:
-    actions, log_density = act_at(navigation, here(batch), noise)
-    first, second = values_at(navigation.critics, here(batch), actions)
+    actions, log_density = act_at(navigation, before(batch), noise)
+    first, second = values_at(navigation.critics, before(batch), actions)
     return (navigation.log_temperature.exp() * log_density - torch.minimum(first, second)).mean()
 
 
 def temperature_loss(navigation: Navigation, batch: NavigationBatch, noise: Tensor) -> Tensor:
-    log_density = act_at(navigation, here(batch), noise)[1]
+    log_density = act_at(navigation, before(batch), noise)[1]
     return -navigation.log_temperature.exp() * (log_density + navigation.config.target_entropy).mean()
 
 
@@ -155,7 +155,7 @@ def test_loss_is_the_sum_of_the_three_of_sac(kind: str, make_navigation: MakeNav
     assert logs["actor_loss"] == pytest.approx(actor)
     assert loss.item() == pytest.approx(critics + actor + temperature)
     assert logs["temperature"] == pytest.approx(navigation.config.initial_temperature)
-    assert logs["entropy"] == pytest.approx(-act_at(navigation, here(batch), noise[0])[1].mean().item())
+    assert logs["entropy"] == pytest.approx(-act_at(navigation, before(batch), noise[0])[1].mean().item())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -202,7 +202,7 @@ def constant(navigation: Navigation, *values: float) -> None:
 def test_targets_take_the_smaller_value_and_add_entropy(make_navigation: MakeNavigation) -> None:
     navigation, batch, noise = make_navigation(gamma=0.9, clip_targets=False), make_batch(), make_noise()
     constant(navigation, -3.0, -5.0)
-    log_density = act_at(navigation, next_to(batch), noise[1])[1].tolist()
+    log_density = act_at(navigation, after(batch), noise[1])[1].tolist()
     rows = zip(batch.rewards.tolist(), batch.continues.tolist(), log_density, strict=True)
     expected = [reward + 0.9 * continues * (-5.0 - 0.1 * density) for reward, continues, density in rows]
     targets = navigation.bellman_targets(batch, noise[1], torch.tensor(0.1, dtype=torch.double))
@@ -277,13 +277,14 @@ def test_deviation_is_limited_for_the_floor_only(kind: str, expected: tuple[floa
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_greedy_action_is_the_mean_and_sampled_ones_follow_the_actor(kind: str, make_navigation) -> None:
-    navigation, (observations, trails) = make_navigation(kind), (each[:1] for each in here(make_batch(kind)))
-    before = policy_at(navigation, (observations, trails)).base_dist
-    assert torch.allclose(navigation.act(observations, trails, None), before.loc.tanh())
+    navigation = make_navigation(kind)
+    observations, trails = (column[:1] for column in before(make_batch(kind)))
+    gaussian = policy_at(navigation, observations, trails).base_dist
+    assert torch.allclose(navigation.act(observations, trails, None), gaussian.loc.tanh())
     many = observations.expand(200, -1, -1, -1), trails.expand(200, -1)
-    actions = navigation.act(*many, torch.Generator().manual_seed(0)).atanh()
-    assert torch.allclose(actions.mean(dim=0), before.loc[0], atol=4 * before.scale.max().item() / math.sqrt(200))
-    assert torch.allclose(actions.std(dim=0), before.scale[0], rtol=0.2)
+    raw = navigation.act(*many, torch.Generator().manual_seed(0)).atanh()
+    assert torch.allclose(raw.mean(dim=0), gaussian.loc[0], atol=4 * gaussian.scale.max().item() / math.sqrt(200))
+    assert torch.allclose(raw.std(dim=0), gaussian.scale[0], rtol=0.2)
 
 
 # --- Mirror --------------------------------------------------------------------------------------------------
@@ -292,15 +293,11 @@ def test_mirrored_batch_exchanges_left_and_right_and_nothing_else() -> None:
     mirrored = batch.mirrored()
     assert torch.equal(mirrored.observations[..., 0], batch.observations[..., -1])
     assert torch.equal(mirrored.next_observations.flip(-1), batch.next_observations)
-    assert torch.equal(mirrored.trails, batch.trails * MIRROR)
-    assert torch.equal(mirrored.next_trails, batch.next_trails * MIRROR)
     assert torch.equal(mirrored.actions[:, 0], batch.actions[:, 0])
     assert torch.equal(mirrored.actions[:, 1], -batch.actions[:, 1])
+    for turned, straight in ((mirrored.trails, batch.trails), (mirrored.next_trails, batch.next_trails)):
+        assert torch.equal(turned[:, 0::3], straight[:, 0::3])
+        assert torch.equal(turned[:, 1::3], -straight[:, 1::3])
+        assert torch.equal(turned[:, 2::3], -straight[:, 2::3])
     assert mirrored.rewards is batch.rewards
     assert mirrored.continues is batch.continues
-
-
-def test_batch_mirrored_twice_is_the_batch() -> None:
-    batch = make_batch()
-    twice = batch.mirrored().mirrored()
-    assert all(torch.equal(getattr(twice, each.name), getattr(batch, each.name)) for each in fields(batch))
