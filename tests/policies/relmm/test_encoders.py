@@ -164,3 +164,18 @@ def test_keypoints_prefer_the_nearest_thing() -> None:
     assert to_near[:2].max() < 0.02
     assert (to_near.diff() > 0).all()
     assert (to_near < to_far).all()
+
+
+@pytest.mark.parametrize("pixel", [(2, 16), (2, 14), (3, 18), (5, 16)])
+def test_thing_nearby_is_found_by_all_keypoints(pixel: tuple[int, int]) -> None:
+    place = [(pixel[0] - 2) * (GRASP_X[1] - GRASP_X[0]) / 3, (pixel[1] - 16) * (GRASP_Y[1] - GRASP_Y[0]) / 3]
+    assert (keypoints(pixel)[:, :2] - torch.tensor(place)).abs().max() < 0.03
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_fresh_keypoints_of_a_mirrored_map_are_mirrored(seed: int) -> None:
+    torch.manual_seed(seed)
+    points, maps = Keypoints(), torch.rand(1, *FloorObserver.shape) * 2 - 1
+    seen, mirrored = (points(each).detach().reshape(-1, 3) for each in (maps, maps.flip(-1)))
+    assert torch.allclose(mirrored, seen * torch.tensor([1.0, -1.0, 1.0]), atol=1e-5)
+    assert seen[:, 1].abs().max() > 1e-3

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -19,12 +20,12 @@ Seen = tuple[Tensor, Tensor]  # an observation and the trail to it
 MakeNavigation = Callable[..., Navigation]
 
 
-class DoubleEncoder(nn.Module):
+class DoubleEncoder(Encoder):
     """The layers of an encoder, in double precision."""
 
     def __init__(self, encoder: Encoder) -> None:
-        super().__init__()
-        self.layers, self.on_floor = encoder.layers, encoder.on_floor
+        nn.Module.__init__(self)
+        self.layers, self.on_floor, self.features = encoder.layers, encoder.on_floor, encoder.features
         if encoder.on_floor:
             self.keypoints, self.embed = encoder.keypoints, encoder.embed
 
@@ -44,10 +45,10 @@ def make_navigation(make_config) -> MakeNavigation:
         torch.manual_seed(0)
         config = make_config("rectified" if kind == "floor" else "dense", **settings)
         navigation = Navigation(config).double()
-        for critics in (navigation.critics, navigation.targets):
-            critics.encoders = nn.ModuleList([DoubleEncoder(each) for each in critics.encoders])
-        if navigation.actor_encoder is not None:
-            navigation.actor_encoder = DoubleEncoder(navigation.actor_encoder)
+        for module in list(navigation.modules()):
+            for name, child in list(module.named_children()):
+                if isinstance(child, Encoder):
+                    setattr(module, name, DoubleEncoder(child))
         for target in navigation.targets.parameters():
             target += 0.1 * torch.randn_like(target)
         return navigation
@@ -287,6 +288,38 @@ def test_greedy_action_is_the_mean_and_sampled_ones_follow_the_actor(kind: str, 
     assert torch.allclose(raw.std(dim=0), gaussian.scale[0], rtol=0.2)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_greedy_action_is_that_of_a_moving_average_of_the_actor(kind: str, make_navigation) -> None:
+    navigation = make_navigation(kind, actor_tau=0.25)
+    encoder = navigation.actor_encoder or navigation.critics.encoders[0]
+    pairs = [
+        *zip(navigation.mean_actor.parameters(), navigation.actor.parameters(), strict=True),
+        *zip(navigation.mean_encoder.parameters(), encoder.parameters(), strict=True),
+    ]
+    assert all(torch.equal(mean, weight) and not mean.requires_grad for mean, weight in pairs)
+    seen = tuple(column[:1] for column in before(make_batch(kind)))
+    greedy, old = navigation.act(*seen, None), [mean.clone() for mean, _ in pairs]
+    with torch.no_grad():
+        for _, weight in pairs:
+            weight += 0.1 * torch.randn_like(weight)
+    assert torch.equal(navigation.act(*seen, None), greedy), "it has not followed yet"
+    navigation.update_targets()
+    wanted = [0.75 * mean + 0.25 * weight for mean, (_, weight) in zip(old, pairs, strict=True)]
+    assert all(torch.allclose(mean, each) for (mean, _), each in zip(pairs, wanted, strict=True))
+    assert not torch.equal(navigation.act(*seen, None), greedy)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_average_over_nothing_is_the_actor_itself(kind: str, make_navigation) -> None:
+    """As in the paper."""
+    navigation, seen = make_navigation(kind, actor_tau=1.0), before(make_batch(kind))
+    with torch.no_grad():
+        for weight in navigation.parameters():
+            weight += 0.1 * torch.randn_like(weight)
+    navigation.update_targets()
+    assert torch.allclose(navigation.act(*seen, None), policy_at(navigation, *seen).base_dist.loc.tanh())
+
+
 # --- Mirror --------------------------------------------------------------------------------------------------
 def test_mirrored_batch_exchanges_left_and_right_and_nothing_else() -> None:
     batch = make_batch()
@@ -301,3 +334,9 @@ def test_mirrored_batch_exchanges_left_and_right_and_nothing_else() -> None:
         assert torch.equal(turned[:, 2::3], -straight[:, 2::3])
     assert mirrored.rewards is batch.rewards
     assert mirrored.continues is batch.continues
+
+
+def test_batch_mirrored_twice_is_the_batch() -> None:
+    batch = make_batch()
+    twice = batch.mirrored().mirrored()
+    assert all(torch.equal(getattr(twice, each.name), getattr(batch, each.name)) for each in fields(batch))

@@ -46,6 +46,39 @@ def test_places_are_seen_from_where_the_robot_is_now() -> None:
     assert features[3] == pytest.approx([0.0, 0.1, -0.5], abs=1e-6)
 
 
+def test_any_way_agrees_with_products_of_transforms() -> None:
+    rng = np.random.default_rng(1)
+    steps = list(zip(rng.uniform(-0.1, MAX_X_VEL, 40), rng.uniform(-100, 100, 40), strict=True))
+    for count in (0, 1, 3, 16, 17, 40):
+        for lag, features in zip(LAGS, after(*steps[:count]), strict=True):
+            since, turned = np.eye(3), 0.0
+            for x_vel, theta_vel in steps[max(count - lag, 0) : count]:
+                forward, turn = x_vel * DRIVE_PULSE_S, math.radians(theta_vel) * DRIVE_PULSE_S
+                (cos, sin), half = (math.cos(turn), math.sin(turn)), turn / 2
+                step = [[cos, -sin, forward * math.cos(half)], [sin, cos, forward * math.sin(half)], [0, 0, 1]]
+                since, turned = since @ np.array(step), turned + turn
+            assert features[:2] == pytest.approx(np.linalg.inv(since)[:2, 2], abs=1e-5)
+            assert features[2] == pytest.approx(np.clip(-turned / math.pi, -2, 2), abs=1e-5)
+
+
+@pytest.mark.parametrize("index", range(len(LAGS)))
+def test_each_lag_sees_its_own_last_steps_alone(index: int) -> None:
+    stand = (0.0, 0.0)
+    for waited in (LAGS[index] - 1, LAGS[index]):
+        features = after(*[stand] * 16, (MAX_X_VEL, 0.0), *[stand] * waited)
+        assert (features[index, 0] != 0) == (waited < LAGS[index])
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_turns_are_limited_to_either_side(side: int) -> None:
+    assert after(*[(0.0, side * MAX_THETA_VEL)] * 16)[:, 2].tolist()[-1] == -2.0 * side
+
+
+def test_what_is_older_than_the_longest_lag_is_forgotten() -> None:
+    recent = [(0.3, 40.0), (0.1, -70.0)] * 8
+    assert after(*[(0.4, 45.0)] * 400, *recent) == pytest.approx(after(*recent), abs=1e-5)
+
+
 def test_curve_ends_where_a_circle_does() -> None:
     """Sixteen small steps along an arc of 90 degrees to the left with a radius of 0.3 m."""
     features = after(*[(0.3 * math.pi / 2 / 16 / DRIVE_PULSE_S, 90 / 16 / DRIVE_PULSE_S)] * 16)
