@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from relmm.features import BASKET_XY, GRASP_X, MAX_THETA_VEL, MAX_X_VEL
+from relmm.features import BASKET_XY, DRIVE_PULSE_S, GRASP_X, MAX_THETA_VEL, MAX_X_VEL
 from relmm.geometry import camera_geometry
 from relmm.robot.body import BUMPER_CENTRE, MAX_OPENING
 from relmm.robot.sensing import ObstacleDetector
@@ -110,6 +110,18 @@ def test_the_last_velocity_is_what_was_driven(body: SimBody, skills: Skills) -> 
     x_vel, theta_vel = skills.last_velocity
     assert x_vel == pytest.approx(0.3, abs=0.03)
     assert theta_vel == pytest.approx(-60.0, abs=6.0)
+
+
+@pytest.mark.parametrize(("x", "x_vel"), [(1.2, 0.0), (1.25, MAX_X_VEL)])
+def test_the_last_velocity_tells_of_turns_away_from_obstacles(body: SimBody, x: float, x_vel: float) -> None:
+    """The motion of the whole step, the way back from a wall and the turn included, over the length of one pulse."""
+    put_robot(body, x, 0.0, 0.0)
+    skills, before = Skills(body, np.random.default_rng(0)), body.truth.robot()
+    skills.navigate(x_vel, 0.0)
+    turned = displacement(body, before)[2]
+    assert abs(turned) > 20
+    assert skills.last_velocity[1] * DRIVE_PULSE_S == pytest.approx(turned, abs=3.0)
+    assert skills.last_velocity[0] * DRIVE_PULSE_S == pytest.approx(body.truth.robot()[0] - before[0], abs=0.03)
 
 
 def test_the_base_stands_still_after_each_step(body: SimBody, skills: Skills) -> None:
