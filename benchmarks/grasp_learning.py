@@ -51,15 +51,13 @@ class HeldOut:
         rng = np.random.default_rng(HELD_OUT_SEED)
         low, high = np.array([GRASP_X[0], GRASP_Y[0]]) + _EDGE, np.array([GRASP_X[1], GRASP_Y[1]]) - _EDGE
         lifted = 0
-        policy.sampling = False
         for index in range(self.count):
             self.robot.reset(HELD_OUT_SEED + index)
             self.robot.body.put_object(int(rng.integers(self.robot.body.room.num_objects)), rng.uniform(low, high))
             self.robot.skills.forget_picture()
             estimate = policy.grasping.estimate(policy.to_pictures(self.robot.get_observation()[FRONT]))
-            self.robot.send_action(policy.grasp(estimate))
+            self.robot.send_action(policy.grasp(estimate, None))
             lifted += self.robot.body.truth.held()
-        policy.sampling = True
         return lifted / self.count
 
 

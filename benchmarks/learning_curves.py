@@ -50,7 +50,7 @@ def room(name: str, steps: int, every: int, *options: str) -> str:
 
 
 RUNS = {
-    "fast_stationary": room("no_obstacles", 4000, 500),
+    "fast_stationary": room("no_obstacles", 4000, 1000),
     "fast_autonomous": room("no_obstacles", 5000, 1000, "--curriculum.type=autonomous"),
     "fast_obstacles": room("obstacles", 10000, 2000),
     "fast_diverse": room("diverse", 10000, 2000),

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from relmm.features import Phase
 from relmm.learning.maps import Maps, to_pictures
 from relmm.learning.replay import Replay
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
@@ -67,12 +68,13 @@ class Learner:
     # --- Grasping -----------------------------------------------------------------------------------------
     @property
     def grasping_has_begun(self) -> bool:
-        """Whether there are N_bt attempts; until then the ensemble knows nothing."""
+        """Whether there were N_bt attempts; until then the ensemble knows nothing."""
         return len(self.replay.attempts) >= self.config.min_attempts_to_update
 
-    def update_grasping(self) -> None:
-        """The updates that follow an attempt, if there are enough attempts to learn from."""
-        if self.grasping_has_begun:
+    def update_grasping(self, phase: int) -> None:
+        """The updates that follow an attempt in a phase, if there are enough attempts to learn from."""
+        frozen = self.config.freeze_grasping and phase != Phase.CURRICULUM
+        if self.grasping_has_begun and self.replay.available(self.replay.attempts) and not frozen:
             for _ in range(self.config.grasp_updates):
                 self._step("grasping", *self._grasp_loss())
             self.maps.version += 1
@@ -95,7 +97,7 @@ class Learner:
             attempts, steps = len(self.replay.attempts), self.replay.navigation_steps
             self.replay.add(picture, (float(motion[0]), float(motion[1])), action, bool(reward > 0), int(phase))
             if update and len(self.replay.attempts) > attempts:
-                self.update_grasping()
+                self.update_grasping(int(phase))
             if update and self.replay.navigation_steps > steps:
                 self.update_navigation()
         self.replay.save_episode()
@@ -103,14 +105,15 @@ class Learner:
     # --- Navigation ---------------------------------------------------------------------------------------
     def update_navigation(self) -> None:
         """The updates that follow a navigation step, if there are enough steps to learn from."""
-        if len(self.replay.steps) >= self.config.min_steps_to_update:
+        begun = len(self.replay.steps) >= self.config.min_steps_to_update
+        if begun and self.replay.available(self.replay.steps):
             for _ in range(self.config.navigation_updates):
                 self._step("navigation", *self._navigation_loss())
                 self.policy.update()
 
     def _navigation_loss(self) -> tuple[torch.Tensor, dict[str, float]]:
         size, replay = self.config.navigation_batch_size, self.replay
-        others = round(size * self.config.pseudo_reset_share) if len(replay.pseudo_reset_steps) else 0
+        others = round(size * self.config.pseudo_reset_share) if replay.available(replay.pseudo_reset_steps) else 0
         rows = replay.steps.rows(replay.sample(replay.steps, size - others, self.rng))
         if others:
             chosen = replay.sample(replay.pseudo_reset_steps, others, self.rng)

@@ -10,6 +10,7 @@ from relmm.features import MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict
 
 # m, where the object is put down. The authors do it at 0.40 in front of the robot; nearer, fewer end up at a wall.
 _PLACE_XY = (0.33, 0.0)
+_TURN_ROUND_STEPS = 6  # 162 degrees: in front there often is a wall by then, and things at a wall are hard to pick up
 _TURN_AWAY_STEPS = 4  # 108 degrees, so that driving on does not push what was just put down
 
 
@@ -29,6 +30,9 @@ def pseudo_reset(rng: np.random.Generator, steps: int, holding: Callable[[], boo
     """
     for _ in range(steps):
         yield drive_anywhere(rng)
+    direction = float(rng.choice((-1.0, 1.0)))
+    for _ in range(_TURN_ROUND_STEPS):
+        yield action_dict(theta_vel=direction * MAX_THETA_VEL)
     if holding():
         yield action_dict(Skill.PLACE, x=_PLACE_XY[0], y=_PLACE_XY[1])
     direction = float(rng.choice((-1.0, 1.0)))

@@ -80,6 +80,7 @@ class Replay:
         self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)  # no memory until written to
         self._trails = np.zeros((capacity, TRAIL_FEATURES), np.float32)
         self._trail, self._drove = Trail(), False
+        self._resetting = False  # whether the last frame was of a pseudo-reset
         self._open_step: dict[str, float] | None = None  # the last navigation step, until it is known where it led
         self._open_table = self.steps  # that it belongs to
         self._first_attempt: int | None = None  # frame of the first attempt since then
@@ -108,6 +109,10 @@ class Replay:
         """
         frame, self.frames = self.frames, self.frames + 1
         self._pictures[frame % self.capacity] = picture
+        if self._resetting and phase != Phase.PSEUDO_RESET:
+            # The search begins anew, as for a policy that is asked again; the last drive leads to another memory.
+            self._trail, self._drove, self._open_step = Trail(), False, None
+        self._resetting = phase == Phase.PSEUDO_RESET
         self._trail, self._drove = self._trail_here(motion), False
         self._trails[frame % self.capacity] = self._trail.features()
         x_vel, theta_vel, skill, x, y = (float(value) for value in action)
@@ -119,8 +124,8 @@ class Replay:
                 self._first_attempt = frame
             return
         self._close_step(frame)
-        self.navigation_steps += phase == Phase.LEARNING
         if round(skill) == Skill.NAVIGATE:
+            self.navigation_steps += phase == Phase.LEARNING
             self._drove = True
             forward, turn = x_vel / MAX_X_VEL * 2 - 1, theta_vel / MAX_THETA_VEL
             self._open_step = {"frame": frame, "forward": forward, "turn": turn}
@@ -131,7 +136,7 @@ class Replay:
         if self._first_attempt is not None:
             self._close_step(self._first_attempt)
         self._open_step = self._first_attempt = None
-        self._trail, self._drove = Trail(), False
+        self._trail, self._drove, self._resetting = Trail(), False, False
         self.episodes += 1
 
     def _close_step(self, following: int, success: bool = False) -> None:
@@ -149,8 +154,8 @@ class Replay:
         return self._trails[frames % self.capacity]
 
     def next_trail(self, motion: tuple[float, float]) -> NDArray[np.float32]:
-        """The trail of a frame that would come next, for an observation with this motion, (15,)."""
-        return self._trail_here(motion).features()
+        """The trail of a step of the policy that would come next, for an observation with this motion, (15,)."""
+        return (Trail() if self._resetting else self._trail_here(motion)).features()
 
     def _trail_here(self, motion: tuple[float, float]) -> Trail:
         trail = self._trail.copy()
@@ -158,7 +163,13 @@ class Replay:
             trail.moved(*motion)
         return trail
 
+    def available(self, table: Table) -> int:
+        """How many rows of one of the tables have pictures that are still there."""
+        return len(table) - self._first(table)
+
     def sample(self, table: Table, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Rows of one of the tables whose pictures are still there, uniformly, with replacement, (count,)."""
-        first = int(np.searchsorted(table["frame"], self.frames - self.capacity))
-        return rng.integers(first, len(table), count)
+        """Such rows, uniformly, with replacement, (count,); there must be one."""
+        return rng.integers(self._first(table), len(table), count)
+
+    def _first(self, table: Table) -> int:
+        return int(np.searchsorted(table["frame"], self.frames - self.capacity))

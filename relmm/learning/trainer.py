@@ -105,8 +105,7 @@ class Trainer:
         estimate = self._look()
         self.life.step(grasp_cell(self._choose_cell(estimate)), phase, self.policy.grasp_probability)
         success = self.life.succeeded
-        if phase == Phase.CURRICULUM or not self.config.freeze_grasping:
-            self.learner.update_grasping()
+        self.learner.update_grasping(phase)
         return success
 
     @property
@@ -129,7 +128,7 @@ class Trainer:
         if self.progress.steps < self.config.random_steps:
             return drive_anywhere(self._rng)
         motion = (self.life.observation["x.vel"], self.life.observation["theta.vel"])
-        return self.policy.navigate(self._pictures(), self.learner.replay.next_trail(motion))
+        return self.policy.navigate(self._pictures(), self.learner.replay.next_trail(motion), self.policy.rng)
 
     def _pseudo_reset(self) -> None:
         for action in pseudo_reset(self._rng, self._pseudo_reset_steps, lambda: self.life.holding):

@@ -159,6 +159,7 @@ class ControllerPolicy(PreTrainedPolicy):
 
     def _act(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
         if state[_HOLDING] > 0.5:
+            row.attempts = 0
             return action_dict(Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
         action = self.decide(image, state, row)
         row.attempts = row.attempts + 1 if action["skill.pos"] == Skill.GRASP else 0

@@ -77,10 +77,10 @@ def test_record_carries_what_it_picked_up_elsewhere(run, tmp_path):
     second = data["episode_index"] == 1
     phases = data["complementary_info.phase"][second]
     pseudo_reset = phases == Phase.PSEUDO_RESET
-    assert pseudo_reset.sum() == 3 + 1 + 4 + 3
+    assert pseudo_reset.sum() == 3 + 6 + 1 + 4 + 3
     assert pseudo_reset[: pseudo_reset.sum()].all()
     skills = data["action"][second][pseudo_reset][:, ACTION_NAMES.index("skill.pos")]
-    assert skills.tolist() == [0] * 3 + [2] + [0] * 7
+    assert skills.tolist() == [0] * 9 + [2] + [0] * 7
     assert not data["next.reward"][second][pseudo_reset].any()
 
 

@@ -12,6 +12,7 @@ import torch
 
 from relmm.commands.policies import make_actor
 from relmm.errors import ConfigError
+from relmm.features import Phase
 from relmm.learning import checkpoint as module
 from relmm.learning.checkpoint import (
     check_same_networks,
@@ -48,7 +49,7 @@ def make_learner(seed: int = 0):
 
 def work(learner: Learner, times: int) -> None:
     for _ in range(times):
-        learner.update_grasping()
+        learner.update_grasping(Phase.LEARNING)
         learner.update_navigation()
 
 

@@ -94,8 +94,8 @@ def test_success_ends_the_episode_and_is_carried_elsewhere(robot):
     assert last[2]["next.reward"] == 1.0
     assert last[2]["next.done"]
     phases = [outcome["complementary_info.phase"] for _, _, outcome, _ in recorder.episodes[1]]
-    assert phases[:9] == [Phase.PSEUDO_RESET] * 9, "2 drives, 1 placement, 4 turns, 2 drives"
-    assert set(phases[9:]) == {Phase.LEARNING}
+    assert phases[:15] == [Phase.PSEUDO_RESET] * 15, "2 drives, 6 turns, 1 placement, 4 turns, 2 drives"
+    assert set(phases[15:]) == {Phase.LEARNING}
     rewards = [outcome["next.reward"] for episode in recorder.episodes for _, _, outcome, _ in episode]
     assert sum(rewards) == 2
 

@@ -107,7 +107,7 @@ class ReLMMConfig(ControllerConfig):
     min_steps_to_update: int = 100
     gamma: float = 0.98
     tau: float = 0.01
-    actor_tau: float = 0.003
+    actor_tau: float = 0.01
     target_entropy: float = -2.0
     initial_temperature: float = 0.1
     clip_targets: bool = True
@@ -184,6 +184,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "gamma": (0, 0.9999),
     "tau": (_TINY, 1),
     "actor_tau": (_TINY, 1),
+    "target_entropy": (-100, 100),
     "initial_temperature": (_TINY, math.inf),
     "pseudo_reset_share": (0, 0.9),
     "refreshed_maps": (0, math.inf),

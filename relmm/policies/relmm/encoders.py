@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from relmm.features import GRID, IMAGE_SIZE
+from relmm.features import GRASP_X, GRASP_Y, GRID, IMAGE_SIZE
 from relmm.geometry import camera_geometry
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.floor import FloorView
@@ -23,7 +23,6 @@ _CELLS = 5
 _ROWS, _COLUMNS = 32, 33
 _NEAR_ROWS = 1  # pixels of the map before the grasp area
 _JUDGED_ROWS = 20  # of them, up to 1.36 m, get a grasp probability; farther off a picture shows too little
-_PIXEL = 0.054  # m
 _HEADS = 8
 _INITIAL_ATTENTION = 6.0  # score of a certain grasp; -6 for a hopeless one
 _POINT_FEATURES = 256
@@ -95,8 +94,9 @@ class Keypoints(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        rows = (torch.arange(_ROWS) - _NEAR_ROWS - 1) * _PIXEL  # m from the middle of the grasp area
-        columns = (torch.arange(_COLUMNS) - _COLUMNS // 2) * _PIXEL
+        forward, left = (_CELLS * (high - low) / GRID for low, high in (GRASP_X, GRASP_Y))  # m, a pixel
+        rows = (torch.arange(_ROWS) - _NEAR_ROWS - 1) * forward  # m from the middle of the grasp area
+        columns = (torch.arange(_COLUMNS) - _COLUMNS // 2) * left
         x, y = torch.meshgrid(rows, columns, indexing="ij")
         self.places: Tensor
         self.register_buffer("places", torch.stack([x, y]).flatten(1), persistent=False)

@@ -55,10 +55,11 @@ class ReLMMPolicy(ControllerPolicy):
         trail: Trail = row.memory.setdefault("trail", Trail())
         if row.memory.pop("drove", False):
             trail.moved(float(state[0]), float(state[1]))
-        if row.attempts < self.config.num_grasp and self._wants_to_grasp(estimate, row):
-            return self.grasp(estimate)
+        rng = self._rng_of(row) if self.sampling else None
+        if row.attempts < self.config.num_grasp and self._wants_to_grasp(estimate, row.attempts, rng):
+            return self.grasp(estimate, rng)
         row.memory["drove"] = True
-        return self.navigate(pictures, trail.features())
+        return self.navigate(pictures, trail.features(), rng)
 
     def look(self, pictures: Tensor) -> Estimate:
         """The ensemble's opinion of pictures 0..1 (batch, 3, 100, 100), which is also remembered."""
@@ -70,16 +71,16 @@ class ReLMMPolicy(ControllerPolicy):
         """P[grasp] of the last picture, -1 before the first."""
         return -1.0 if self.estimate is None else float(self.grasping.grasp_probability(self.estimate)[0])
 
-    def grasp(self, estimate: Estimate) -> dict[str, float]:
-        """The best cell of the ensemble's mean, or a sampled one (paper eq. 2) if `sampling`."""
-        cells = self.grasping.sample(estimate, self.rng) if self.sampling else estimate.mean.argmax(dim=1)
+    def grasp(self, estimate: Estimate, rng: torch.Generator | None) -> dict[str, float]:
+        """A sampled cell (paper eq. 2), or the best one of the ensemble's mean without random numbers."""
+        cells = estimate.mean.argmax(dim=1) if rng is None else self.grasping.sample(estimate, rng)
         return grasp_cell(int(cells[0]))
 
-    def navigate(self, pictures: Tensor, trail: NDArray[np.float32]) -> dict[str, float]:
-        """A navigation step for one picture and trail: the mean action, or a sampled one if `sampling`."""
+    def navigate(self, pictures: Tensor, trail: NDArray[np.float32], rng: torch.Generator | None) -> dict[str, float]:
+        """A navigation step for one picture and trail: sampled, or the mean action without random numbers."""
         observations = self.observer(pictures, self.grasping)
         trails = torch.from_numpy(trail[None]).to(self.weights_device)
-        action = self.navigation.act(observations, trails, self.rng if self.sampling else None)[0]
+        action = self.navigation.act(observations, trails, rng)[0]
         return to_navigation_step(action.tolist())
 
     def to_pictures(self, image: NDArray[Any]) -> Tensor:
@@ -91,11 +92,18 @@ class ReLMMPolicy(ControllerPolicy):
         """Where the weights are."""
         return self.navigation.log_temperature.device
 
-    def _wants_to_grasp(self, estimate: Estimate, row: Row) -> bool:
-        if not self.sampling:
+    def _rng_of(self, row: Row) -> torch.Generator:
+        """The robot's own random numbers, so that batching changes nothing."""
+        if "rng" not in row.memory:
+            row.memory["rng"] = torch.Generator().manual_seed(int(row.rng.integers(2**63)))
+        generator: torch.Generator = row.memory["rng"]
+        return generator
+
+    def _wants_to_grasp(self, estimate: Estimate, attempts: int, rng: torch.Generator | None) -> bool:
+        if rng is None:
             return float(estimate.mean.amax()) >= self.config.grasp_threshold
         # Once decided, up to N_grasp attempts follow (paper Algorithm 1).
-        return row.attempts > 0 or float(torch.rand(1, generator=self.rng)) <= self.grasp_probability
+        return attempts > 0 or float(torch.rand(1, generator=rng)) <= self.grasp_probability
 
     # --- Learning -----------------------------------------------------------------------------------------
     def forward(self, batch: dict[str, Any], **kwargs: Any) -> tuple[Tensor, dict[str, Any] | None]:
@@ -154,6 +162,8 @@ class ReLMMPolicy(ControllerPolicy):
         own = attempted.long().cumprod(dim=1).bool()
         success = (own & (batch["next.reward"][steps][:, 1:] > 0.5)).any(dim=1)
         after = (own.sum(dim=1) + 1).clamp(max=pictures.shape[1] - 1)
+        # At the episode's end there is no step after the attempts: the picture before them is what the drive led to.
+        after = torch.where(_padded(batch, steps).gather(1, after[:, None]).squeeze(1), 1, after)
         rows = torch.arange(len(pictures), device=pictures.device)
         following = pictures[rows, after]
         # Single frames know nothing of before: a robot that has just begun.
@@ -186,9 +196,18 @@ def from_navigation_steps(actions: Tensor) -> Tensor:
 
 def _drives(batch: dict[str, Any], skills: Tensor) -> Tensor:
     """Which frames are navigation steps whose next picture is in the batch, (batch,) bool."""
-    padded = batch.get(f"{IMAGE_KEY}_is_pad")
     drives = skills == Skill.NAVIGATE
-    return drives if padded is None else drives & ~padded[:, 1]
+    return drives & ~_padded(batch, drives.new_ones(len(drives)))[:, 1]
+
+
+def _padded(batch: dict[str, Any], rows: Tensor) -> Tensor:
+    """Which frames lie beyond their episode's end, (rows, time) bool."""
+    padded: Tensor | None = batch.get(f"{IMAGE_KEY}_is_pad")
+    return (
+        torch.zeros(batch["action"].shape[:2], dtype=torch.bool, device=rows.device)[rows]
+        if padded is None
+        else padded[rows]
+    )
 
 
 def _attempts(batch: dict[str, Any], attempts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
