@@ -257,7 +257,7 @@ def test_frames_are_taken_as_recorders_take_them(numbered) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_what_is_sampled_still_has_its_pictures(capacity: int, seed: int, fill: Fill, number_of, motion_of) -> None:
     life = random_life(seed)
-    life.append("drdffs")  # so that each table has rows
+    life.append("drrdfs")  # so that each table has rows
     replay = fill(life, capacity)
     rng = np.random.default_rng(0)
     for table in (replay.attempts, replay.steps, replay.pseudo_reset_steps):
