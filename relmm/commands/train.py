@@ -95,8 +95,7 @@ class Run:
                 self._read(root, "reading the run's own dataset", update_from=cursor, count=True)
 
     def _read(self, root: Path, title: str, update_from: int | None, count: bool = False) -> None:
-        total = summarize(root).episodes
-        with progress(total, "episode", title, leave=False) as bar:
+        with progress(_recorded(root), "episode", title, leave=False) as bar:
             for episode in read_episodes(root):
                 update = update_from is not None and episode.index >= update_from
                 self.learner.read(episode, update)
@@ -160,7 +159,7 @@ def _train_on_robot(run: Run) -> None:
     if not config.resume:
         check_new(config.dataset_root, config.dataset.repo_id)
     run.load_data()
-    seed = config.seed + (summarize(config.dataset_root).episodes if run.replay.episodes and config.resume else 0)
+    seed = config.seed + (_recorded(config.dataset_root) if config.resume else 0)
     robot = _make_robot(replace(config.robot), seed)
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
@@ -193,6 +192,11 @@ def _train_on_robot(run: Run) -> None:
                 bar.update(run.progress.steps)
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
     print(summarize(config.dataset_root))
+
+
+def _recorded(root: Path) -> int:
+    """Episodes of a dataset, 0 if none has been saved yet."""
+    return summarize(root).episodes if any(root.glob("data/*/*.parquet")) else 0
 
 
 def _make_robot(config: RobotConfig, seed: int) -> LocobotRobot:
@@ -245,7 +249,7 @@ def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
 def _train_on_stream(run: Run, root: Path) -> None:
     config = run.config
     run.load_data()
-    read = summarize(root).episodes if config.resume else 0
+    read = _recorded(root) if config.resume else 0
     follower = EpisodeFollower(root, read)
 
     def episodes() -> Iterator[Any]:
