@@ -21,7 +21,7 @@ def describe_action(action: dict[str, float]) -> str:
         case Skill.PLACE:
             return "into the basket"
         case _:
-            return f"drive {action['x.vel']:.2f} m/s, {action['theta.vel']:+.0f} deg/s"
+            return f"{action['x.vel']:.2f} m/s, {action['theta.vel']:+.0f} deg/s"
 
 
 def grasp_map(actor: Actor, action: dict[str, float]) -> NDArray[np.uint8] | None:

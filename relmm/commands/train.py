@@ -70,6 +70,7 @@ class Run:
             check_same_networks(self.checkpoint, config.policy.fingerprint())
             config.policy.pretrained_path = pretrained_model(self.checkpoint)
         self.actor = make_actor(config.policy)
+        config.policy.pretrained_path = None  # a checkpoint stands for itself, wherever it is copied to
         policy = self.actor.policy
         assert isinstance(policy, ReLMMPolicy)
         self.policy = policy
@@ -191,7 +192,8 @@ def _train_on_robot(run: Run) -> None:
             with progress(config.steps, "step", "training") as bar:
                 bar.update(run.progress.steps)
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
-    print(summarize(config.dataset_root))
+    if _recorded(config.dataset_root):
+        print(summarize(config.dataset_root))
 
 
 def _recorded(root: Path) -> int:
