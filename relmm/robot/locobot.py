@@ -211,6 +211,7 @@ class LocobotRobot(Robot):
         self.skills.place(x, y)
         if self.skills.holding:
             logger.warning("Nothing was placed: something is in the arm's way.")
+            self.skills.navigate(0.0, 0.0)  # what is reported is what happens
             return action_dict()
         return action_dict(Skill.PLACE, x=x, y=y)
 

@@ -61,6 +61,11 @@ class ReLMMPolicy(ControllerPolicy):
         row.memory["drove"] = True
         return self.navigate(pictures, trail.features(), rng)
 
+    def forget_search(self, row: Row) -> None:
+        """Begin with an empty trail, as training does after a pseudo-reset."""
+        row.memory.pop("trail", None)
+        row.memory.pop("drove", None)
+
     def look(self, pictures: Tensor) -> Estimate:
         """The ensemble's opinion of pictures 0..1 (batch, 3, 100, 100), which is also remembered."""
         self.estimate = self.grasping.estimate(pictures)
