@@ -124,6 +124,8 @@ class Replay:
                 self._first_attempt = frame
             return
         self._close_step(frame)
+        if round(skill) == Skill.PLACE:
+            self._trail = Trail()  # what comes next is another search
         if round(skill) == Skill.NAVIGATE:
             self.navigation_steps += phase == Phase.LEARNING
             self._drove = True

@@ -82,13 +82,13 @@ def steps_of(life: Life, kind: str) -> list[Step]:
 def trails_of(life: Life, motion_of) -> np.ndarray:
     """Of each frame, slowly: the drives before it, with the motions that the frames after them saw.
 
-    They count since the beginning of the episode, and of the search after a pseudo-reset.
+    They count since the beginning of the episode, and of the search after a placement or a pseudo-reset.
     """
     trails, start = [], 0
     for episode in life:
         for index in range(len(episode)):
             trail = Trail()
-            ends = [k for k in range(1, index + 1) if episode[k - 1] == "r" != episode[k]]
+            ends = [k for k in range(1, index + 1) if episode[k - 1] == "p" or episode[k - 1] == "r" != episode[k]]
             for earlier in range(max(ends, default=0), index):
                 if episode[earlier] in "dr":
                     trail.moved(*motion_of(start + earlier + 1))

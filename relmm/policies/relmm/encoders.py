@@ -17,17 +17,15 @@ from relmm.policies.relmm.floor import FloorView
 from relmm.policies.relmm.grasping import GraspEnsemble, RectifiedBackbone
 from relmm.policies.relmm.trail import TRAIL_FEATURES
 
-# A pixel of the navigation map is 5x5 grasp cells, 5.5 cm: the grasp area is 3x3 pixels. The map reaches 1.78 m ahead
-# and 0.88 m to either side; farther off, an object is less than two pixels of the picture.
-_CELLS = 5
-_ROWS, _COLUMNS = 32, 33
+# A pixel of the navigation map is 7x7 grasp cells, 7.7 cm. The map reaches 2.4 m ahead and 1.2 m to either side: as
+# far as a grown ensemble recognises what it has learned at arm's length.
+_CELLS = 7
+_ROWS, _COLUMNS = 30, 31
 _NEAR_ROWS = 1  # pixels of the map before the grasp area
-_JUDGED_ROWS = 20  # of them, up to 1.36 m, get a grasp probability; farther off a picture shows too little
 _HEADS = 8
 _INITIAL_ATTENTION = 6.0  # score of a certain grasp; -6 for a hopeless one
 _POINT_FEATURES = 256
 _CONVOLUTION_FEATURES = 128
-_MAP_MEMBERS = 2  # of the ensemble, that draw the map
 
 
 class PictureObserver(nn.Module):
@@ -60,19 +58,17 @@ class FloorObserver(nn.Module):
         rows, columns = _ROWS * _CELLS, _COLUMNS * _CELLS
         self._margin = margin
         self.view = FloorView(camera, row - margin, column - margin, rows + 2 * margin, columns + 2 * margin)
-        visible = (self.view.grid.abs() <= 1).all(dim=-1)[margin:-margin, margin:-margin][: _JUDGED_ROWS * _CELLS]
+        visible = (self.view.grid.abs() <= 1).all(dim=-1)[margin:-margin, margin:-margin]
         self.visible: Tensor
         self.register_buffer("visible", visible, persistent=False)
 
     @torch.no_grad()
     def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
-        """Grasp probability (the highest in each pixel) and RGB (their mean), uint8, (batch, 4, 32, 33)."""
+        """Grasp probability (the highest in each pixel) and RGB (their mean), uint8, (batch, 4, 30, 31)."""
         assert isinstance(grasping.backbone, RectifiedBackbone)
         floor = self.view(images)
-        judged = floor[:, :, : _JUDGED_ROWS * _CELLS + 2 * self._margin]
-        logits = grasping.backbone.on_map(judged, members=_MAP_MEMBERS).mean(dim=0)
+        logits = grasping.backbone.on_map(floor, members=1)[0]  # all six would take six times as long
         graspable = functional.max_pool2d(logits.sigmoid() * self.visible, _CELLS)
-        graspable = functional.pad(graspable, (0, 0, 0, _ROWS - _JUDGED_ROWS))
         inner = floor[:, :, self._margin : -self._margin, self._margin : -self._margin]
         colours = functional.avg_pool2d(inner, _CELLS) / 2 + 0.5
         return (torch.cat([graspable[:, None], colours], dim=1) * 255).round().to(torch.uint8)
@@ -95,7 +91,7 @@ class Keypoints(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         forward, left = (_CELLS * (high - low) / GRID for low, high in (GRASP_X, GRASP_Y))  # m, a pixel
-        rows = (torch.arange(_ROWS) - _NEAR_ROWS - 1) * forward  # m from the middle of the grasp area
+        rows = (torch.arange(_ROWS) - _NEAR_ROWS + 0.5 - GRID / 2 / _CELLS) * forward  # m from the grasp area's middle
         columns = (torch.arange(_COLUMNS) - _COLUMNS // 2) * left
         x, y = torch.meshgrid(rows, columns, indexing="ij")
         self.places: Tensor
@@ -108,7 +104,7 @@ class Keypoints(nn.Module):
         self.prefer = nn.Parameter(-self.places.norm(dim=0) / reach)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Maps in -1..1, (batch, 4, 32, 33) -> x and y in m and graspability of each point, (batch, 3 * heads)."""
+        """Maps in -1..1, (batch, 4, 30, 31) -> x and y in m and graspability of each point, (batch, 3 * heads)."""
         attention = (self.look(maps).flatten(2) + self.prefer).softmax(dim=-1)
         graspable = maps[:, :1].flatten(2)
         values = torch.cat([self.places.expand(len(maps), -1, -1), graspable], dim=1)

@@ -210,7 +210,7 @@ def test_navigation_steps_beyond_the_range_are_clipped() -> None:
 
 
 def test_policy_remembers_its_trail_from_the_drives_it_asked_for(make_policy_of, make_batch, empty) -> None:
-    """A step's velocities are in the state after it; attempts and placements are no steps."""
+    """A step's velocities are in the state after it; what follows a placement is another search."""
     policy, given = make_policy_of(seed=1, grasp_threshold=1.0), []
     navigate = policy.navigate
     policy.navigate = lambda pictures, trail, rng: (given.append(trail), navigate(pictures, trail, rng))[1]
@@ -219,10 +219,13 @@ def test_policy_remembers_its_trail_from_the_drives_it_asked_for(make_policy_of,
     assert np.array_equal(given[-1], expected.features()), "what came before the first step is unknown"
     for motion in driven:
         batch[STATE_KEY][0, :2] = torch.tensor(motion)
-        policy.select_action(make_batch(empty, holding=(0,)))
         policy.select_action(batch)
         expected.moved(*motion)
         assert given[-1] == pytest.approx(expected.features(), abs=1e-6)
+    policy.select_action(make_batch(empty, holding=(0,)))
+    policy.select_action(batch)
+    assert np.array_equal(given[-1], Trail().features())
+    policy.select_action(batch)
     policy.reset()
     policy.select_action(batch)
     assert np.array_equal(given[-1], Trail().features())
