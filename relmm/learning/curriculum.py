@@ -43,7 +43,8 @@ class AutonomousCurriculum:
     Attributes:
         num_start: failures in a row that end a session without a success (N_start).
         num_stop: failures since the last success that end one with a success (N_stop).
-        num_max: attempts after which the curriculum is over (N_max).
+        num_max: attempts, from the first success on, after which the curriculum is over (N_max). The paper counts all;
+            in the authors' code the first session lasts until the first success, so both begin to navigate knowing one.
     """
 
     num_start: int
@@ -51,7 +52,7 @@ class AutonomousCurriculum:
     num_max: int
 
     def active(self, attempts: int) -> bool:
-        """Whether it is still on after so many attempts; P[grasp] is 1 then."""
+        """Whether it is still on after so many attempts since the first success, 0 before; P[grasp] is 1 then."""
         return attempts < self.num_max
 
     def session(self) -> Practice:

@@ -75,8 +75,12 @@ class Learner:
         """The updates that follow an attempt in a phase, if there are enough attempts to learn from."""
         frozen = self.config.freeze_grasping and phase != Phase.CURRICULUM
         if self.grasping_has_begun and self.replay.available(self.replay.attempts) and not frozen:
+            only_failures = self.replay.attempts_since_first_success == 0
             for _ in range(self.config.grasp_updates):
-                self._step("grasping", *self._grasp_loss())
+                loss, logs = self._grasp_loss()
+                if only_failures and logs["grasp_loss"] < self.config.min_failure_loss:
+                    break
+                self._step("grasping", loss, logs)
             self.maps.version += 1
 
     def _grasp_loss(self) -> tuple[torch.Tensor, dict[str, float]]:

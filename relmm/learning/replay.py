@@ -147,6 +147,12 @@ class Replay:
         self._open_step = self._first_attempt = None
 
     # --- Reading ------------------------------------------------------------------------------------------
+    @property
+    def attempts_since_first_success(self) -> int:
+        """How many attempts there were from the first that succeeded on, 0 if none has."""
+        successes = self.attempts["success"]
+        return len(successes) - int(successes.argmax()) if successes.any() else 0
+
     def pictures(self, frames: NDArray[np.int64]) -> NDArray[np.uint8]:
         """The pictures of frames, uint8 (n, 100, 100, 3)."""
         return self._pictures[frames % self.capacity]

@@ -111,7 +111,7 @@ class Trainer:
     @property
     def _practising(self) -> bool:
         """Whether the autonomous curriculum is still on; it counts all attempts there are to learn from."""
-        return self._autonomous.active(len(self.learner.replay.attempts))
+        return self._autonomous.active(self.learner.replay.attempts_since_first_success)
 
     def _choose_cell(self, estimate: Estimate) -> int:
         if not self.learner.grasping_has_begun:

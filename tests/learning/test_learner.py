@@ -73,6 +73,10 @@ def weights(module: torch.nn.Module) -> list[torch.Tensor]:
     return [weight.detach().clone() for weight in module.parameters()]
 
 
+def to_images(replay: Replay, frames: range) -> torch.Tensor:
+    return to_pictures(replay.pictures(np.array(frames)), torch.device("cpu"))
+
+
 def same(first: list[torch.Tensor], second: list[torch.Tensor]) -> bool:
     return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
@@ -87,6 +91,24 @@ def test_ensemble_waits_for_n_bt_attempts(attempts: int, updates: int, make_lear
     assert learner.grasping_has_begun == (updates > 0)
     assert learner.maps.version == (updates > 0)
     assert ("grasp_loss" in learner.logs) == (updates > 0)
+
+
+def test_failures_alone_teach_the_ensemble_only_until_its_loss_is_small(make_learner, count_steps) -> None:
+    learner = make_learner("f" * 20, min_failure_loss=0.1)
+    before = learner.policy.grasping.estimate(to_images(learner.replay, range(20)))
+    counts = count_steps(learner)
+    for _ in range(200):
+        learner.update_grasping(Phase.LEARNING)
+    assert 0 < counts["grasping"] < 400, "it stops by itself"
+    after = learner.policy.grasping.estimate(to_images(learner.replay, range(20)))
+    assert after.std.mean() > before.std.mean() / 10, "the members still disagree"
+
+
+def test_ensemble_learns_from_all_once_something_was_picked_up(make_learner, count_steps) -> None:
+    learner = make_learner("f" * 19 + "s", min_failure_loss=100.0)
+    counts = count_steps(learner)
+    learner.update_grasping(Phase.LEARNING)
+    assert counts["grasping"] == learner.config.grasp_updates
 
 
 @pytest.mark.parametrize(("steps", "updates"), [(2, 0), (3, 4), (6, 4)])

@@ -40,6 +40,7 @@ class World:
     wanted: float = 0.5
     events: list[Event] = field(default_factory=list)
     actions: list[dict[str, float]] = field(default_factory=list)
+    grasps: list[bool] = field(default_factory=list)  # whether each succeeded
     holding: bool = False
     stuck: bool = False  # whether nothing can be put down: something is in the way
 
@@ -54,7 +55,12 @@ class World:
     def grasp(self, phase: Phase) -> bool:
         self.events.append(("grasp", phase))
         self.holding = bool(self._successes.random() < self.success)
+        self.grasps.append(self.holding)
         return self.holding
+
+    @property
+    def attempts_since_first_success(self) -> int:
+        return len(self.grasps[self.grasps.index(True) :]) if True in self.grasps else 0
 
     def place(self, phase: Phase) -> None:
         self.events.append(("place", phase))
@@ -104,13 +110,28 @@ class FakePolicy:
         return POLICY_DRIVE
 
 
+class FakeReplay:
+    """Holds the world's attempts."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.attempts = world.grasps
+
+    @property
+    def attempts_since_first_success(self) -> int:
+        return self._world.attempts_since_first_success
+
+    def next_trail(self, motion: tuple[float, float]) -> np.ndarray:
+        return np.array(motion)
+
+
 class FakeLearner:
     """Notes when it is asked to learn."""
 
     def __init__(self, world: World, min_attempts: int) -> None:
         self._world, self._min_attempts = world, min_attempts
         self.phases: list[int] = []  # of the attempts that it was asked to learn from
-        self.replay = SimpleNamespace(attempts=[], next_trail=lambda motion: np.array(motion))
+        self.replay = FakeReplay(world)
 
     @property
     def grasping_has_begun(self) -> bool:
@@ -125,8 +146,7 @@ class FakeLearner:
 
     # --- As a recorder --------------------------------------------------------------------------------------
     def add_frame(self, observation: Any, action: dict[str, float], outcome: Any, task: str) -> None:
-        if action["skill.pos"] == Skill.GRASP:
-            self.replay.attempts.append(action)
+        pass
 
     def save_episode(self) -> None:
         pass
@@ -180,18 +200,16 @@ def train_grasp(world: World, n: int, st: bool, phase: Phase) -> bool:
 
 
 def train_grasp_auto_curr(world: World, config: ReLMMConfig) -> bool:
-    """Algorithm 3."""
-    attempts = sum(name == "grasp" for name, _ in world.events)
-    if attempts >= config.num_max:
+    """Algorithm 3; attempts count from the first success on, as in the authors' code."""
+    if world.attempts_since_first_success >= config.num_max:
         return train_grasp(world, config.num_grasp, False, Phase.LEARNING)
     n_since, r_max = 0, False
     while True:
         r_g = world.grasp(Phase.CURRICULUM)
-        attempts += 1
         world.events.append(LEARN_GRASP)
         n_since = 0 if r_g else n_since + 1
         r_max = r_max or r_g
-        if attempts >= config.num_max:
+        if world.attempts_since_first_success >= config.num_max:
             break
         if r_max:
             if n_since >= config.num_stop:
@@ -215,7 +233,7 @@ def pseudo_reset(world: World) -> None:
 
 def relmm_step(world: World, config: ReLMMConfig, autonomous: bool) -> None:
     """The loop of Algorithms 2 and 4; P[grasp] is 1 while the curriculum lasts, and that of the picture after a_n."""
-    practising = autonomous and sum(name == "grasp" for name, _ in world.events) < config.num_max
+    practising = autonomous and world.attempts_since_first_success < config.num_max
     world.drive(Phase.LEARNING)
     r_g = False
     if practising or world.grasp_wanted:
@@ -250,7 +268,8 @@ def test_training_with_the_autonomous_curriculum_is_algorithm_4(seed: int, succe
         run.trainer.navigation_step()
         relmm_step(paper, run.policy.config, autonomous=True)
     assert run.world.events == paper.events
-    assert run.progress.practice_attempts == 50
+    failures_before = run.world.grasps.index(True)
+    assert run.progress.practice_attempts == failures_before + 50
 
 
 def test_nobody_grasps_where_p_grasp_is_0(make_run: MakeRun) -> None:
@@ -296,7 +315,7 @@ def test_cells_are_uniform_until_the_ensemble_has_begun_to_learn(make_run: MakeR
 @pytest.mark.parametrize(("curriculum", "phase"), [("none", Phase.LEARNING), ("autonomous", Phase.CURRICULUM)])
 def test_learner_is_told_why_it_was_grasped(curriculum: str, phase: Phase, make_run: MakeRun) -> None:
     """A frozen ensemble learns from curricula only."""
-    run = make_run(World(0, success=0.0, wanted=1.0), curriculum, num_max=8)
+    run = make_run(World(0, success=0.0, wanted=1.0), curriculum)
     for _ in range(3):
         run.trainer.navigation_step()
     assert run.trainer.learner.phases == [phase] * 6

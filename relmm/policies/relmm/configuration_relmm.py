@@ -40,12 +40,14 @@ class ReLMMConfig(ControllerConfig):
         grasp_threshold: mean success above which the greedy policy grasps.
         grasp_learning_rate, grasp_batch_size: of the ensemble's optimiser.
         grasp_updates: per attempt.
+        min_failure_loss: until the first success, the ensemble does not learn where its loss is below this: failures
+            alone would teach it that nothing can be grasped anywhere, and its members to agree on that.
         freeze_grasping: the ensemble learns in the curriculum only.
         num_stationary: attempts of the stationary curriculum.
         min_attempts_to_update: attempts stored before the first update; until then cells are drawn uniformly.
         num_start: failures in a row that end a practice session of the autonomous curriculum without a success.
         num_stop: failures since the last success that end one with a success.
-        num_max: attempts after which the autonomous curriculum ends.
+        num_max: attempts, from the first success on, after which the autonomous curriculum ends.
 
         navigation_encoder: `floor` (map of the floor with grasp probabilities), `paper` or `paper_small` (pictures).
         navigation_hidden: width of the dense layers.
@@ -75,7 +77,7 @@ class ReLMMConfig(ControllerConfig):
     num_members: int = 6  # M; the appendix calls it N
     grasp_channels: int = 16
     grasp_initial_logit: float = -2.0
-    grasp_initial_spread: float = 1.0
+    grasp_initial_spread: float = 5.0
     # Paper eq. 2; the authors' code applies both to probabilities, inside the softmax only.
     mean_weight: float = 10.0  # alpha
     std_weight: float = 10.0  # beta
@@ -86,6 +88,7 @@ class ReLMMConfig(ControllerConfig):
     grasp_learning_rate: float = 1e-3
     grasp_batch_size: int = 64
     grasp_updates: int = 4
+    min_failure_loss: float = 0.1
     freeze_grasping: bool = False
     # Curricula (paper 4.4 and App. "Grasping Curriculum").
     num_stationary: int = 200  # N_st
@@ -170,6 +173,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "grasp_learning_rate": (_TINY, 1),
     "grasp_batch_size": (1, math.inf),
     "grasp_updates": (0, math.inf),
+    "min_failure_loss": (0, math.inf),
     "num_stationary": (1, math.inf),
     "min_attempts_to_update": (1, math.inf),
     "num_start": (1, math.inf),

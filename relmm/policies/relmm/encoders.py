@@ -58,9 +58,13 @@ class FloorObserver(nn.Module):
         rows, columns = _ROWS * _CELLS, _COLUMNS * _CELLS
         self._margin = margin
         self.view = FloorView(camera, row - margin, column - margin, rows + 2 * margin, columns + 2 * margin)
-        visible = (self.view.grid.abs() <= 1).all(dim=-1)[margin:-margin, margin:-margin]
-        self.visible: Tensor
-        self.register_buffer("visible", visible, persistent=False)
+        # A cell is judged by the floor round it; the picture's edge looks like an object where no grasp has taught
+        # otherwise, that is, outside the grasp area.
+        outside = (self.view.grid.abs() > 1).any(dim=-1)
+        known = functional.max_pool2d(outside.float()[None], 2 * margin + 1, stride=1)[0] == 0
+        known[-row : GRID - row, -column : GRID - column] = ~outside[margin - row :, margin - column :][:GRID, :GRID]
+        self.known: Tensor
+        self.register_buffer("known", known, persistent=False)
 
     @torch.no_grad()
     def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
@@ -68,7 +72,7 @@ class FloorObserver(nn.Module):
         assert isinstance(grasping.backbone, RectifiedBackbone)
         floor = self.view(images)
         logits = grasping.backbone.on_map(floor, members=1)[0]  # all six would take six times as long
-        graspable = functional.max_pool2d(logits.sigmoid() * self.visible, _CELLS)
+        graspable = functional.max_pool2d(logits.sigmoid() * self.known, _CELLS)
         inner = floor[:, :, self._margin : -self._margin, self._margin : -self._margin]
         colours = functional.avg_pool2d(inner, _CELLS) / 2 + 0.5
         return (torch.cat([graspable[:, None], colours], dim=1) * 255).round().to(torch.uint8)

@@ -82,12 +82,17 @@ def test_mirrored_floor_gives_a_mirrored_map(observer, ensemble, see_green, nois
 
 
 @pytest.mark.parametrize("camera", ["paper", "d435"])
-def test_nothing_is_graspable_out_of_view(camera, make_config) -> None:
+def test_nothing_is_graspable_where_the_floor_round_it_is_out_of_view(camera, make_config) -> None:
     config = make_config(camera=camera, grasp_initial_logit=5.0, grasp_initial_spread=0.0)
     observer = FloorObserver(config)
     graspable = observer(torch.zeros(1, 3, 100, 100), GraspEnsemble(config))[0, 0]
-    visible = functional.max_pool2d((observer.view.grid.abs() <= 1).all(-1)[4:-4, 4:-4].float()[None], PIXEL)[0]
-    assert torch.equal(graspable > 0, visible > 0)
+    in_view = (observer.view.grid.abs() <= 1).all(-1)
+    patches = in_view.unfold(0, 9, 1).unfold(1, 9, 1).all(-1).all(-1)
+    first_row, first_column = PIXEL, (31 * PIXEL - GRID) // 2
+    grasp_area = slice(first_row, first_row + GRID), slice(first_column, first_column + GRID)
+    patches[grasp_area] = in_view[4:-4, 4:-4][grasp_area]
+    expected = functional.max_pool2d(patches.float()[None], PIXEL)[0]
+    assert torch.equal(graspable > 0, expected > 0)
     assert 0 < (graspable > 0).float().mean() < 1
 
 
