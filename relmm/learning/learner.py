@@ -90,8 +90,8 @@ class Learner:
         pictures = to_pictures(self.replay.pictures(attempts["frame"][rows]), device)
         cells = torch.from_numpy(attempts["cell"][rows]).to(device)
         successes = torch.from_numpy(attempts["success"][rows]).to(device)
-        loss = self.policy.grasping.loss(pictures, cells, successes)
-        return loss, {"grasp_loss": loss.item() / self.config.num_members}
+        others = to_pictures(self.replay.pictures(self.replay.sample_frames(len(rows), self.rng)), device)
+        return self.policy.grasp_loss(pictures, cells, successes, others, self.noise)
 
     # --- Recorded episodes --------------------------------------------------------------------------------
     def read(self, episode: RecordedEpisode, update: bool) -> None:

@@ -179,5 +179,9 @@ class Replay:
         """Such rows, uniformly, with replacement, (count,); there must be one."""
         return rng.integers(self._first(table), len(table), count)
 
+    def sample_frames(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Any frames whose pictures are still there, uniformly, with replacement, (count,)."""
+        return rng.integers(max(self.frames - self.capacity, 0), self.frames, count)
+
     def _first(self, table: Table) -> int:
         return int(np.searchsorted(table["frame"], self.frames - self.capacity))

@@ -42,6 +42,8 @@ class ReLMMConfig(ControllerConfig):
         grasp_updates: per attempt.
         min_failure_loss: until the first success, the ensemble does not learn where its loss is below this: failures
             alone would teach it that nothing can be grasped anywhere, and its members to agree on that.
+        background_weight: how much the member that draws the navigation's map learns, from random places beyond reach,
+            that nothing can be grasped there.
         freeze_grasping: the ensemble learns in the curriculum only.
         num_stationary: attempts of the stationary curriculum.
         min_attempts_to_update: attempts stored before the first update; until then cells are drawn uniformly.
@@ -89,6 +91,7 @@ class ReLMMConfig(ControllerConfig):
     grasp_batch_size: int = 64
     grasp_updates: int = 4
     min_failure_loss: float = 0.1
+    background_weight: float = 0.3
     freeze_grasping: bool = False
     # Curricula (paper 4.4 and App. "Grasping Curriculum").
     num_stationary: int = 200  # N_st
@@ -174,6 +177,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "grasp_batch_size": (1, math.inf),
     "grasp_updates": (0, math.inf),
     "min_failure_loss": (0, math.inf),
+    "background_weight": (0, math.inf),
     "num_stationary": (1, math.inf),
     "min_attempts_to_update": (1, math.inf),
     "num_start": (1, math.inf),

@@ -65,6 +65,10 @@ class FloorObserver(nn.Module):
         known[-row : GRID - row, -column : GRID - column] = ~outside[margin - row :, margin - column :][:GRID, :GRID]
         self.known: Tensor
         self.register_buffer("known", known, persistent=False)
+        beyond = known.clone()
+        beyond[: GRID - row] = False
+        self.beyond_reach: Tensor
+        self.register_buffer("beyond_reach", beyond.nonzero(), persistent=False)  # (n, 2)
 
     @torch.no_grad()
     def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
@@ -76,6 +80,20 @@ class FloorObserver(nn.Module):
         inner = floor[:, :, self._margin : -self._margin, self._margin : -self._margin]
         colours = functional.avg_pool2d(inner, _CELLS) / 2 + 0.5
         return (torch.cat([graspable[:, None], colours], dim=1) * 255).round().to(torch.uint8)
+
+    def background_loss(self, images: Tensor, grasping: GraspEnsemble, rng: torch.Generator) -> Tensor:
+        """Cross-entropy of "nothing to grasp here" at one random place beyond the arm's reach in each picture.
+
+        No attempt is ever made at walls or furniture, so the network that draws the map would answer there as it
+        pleases. Nearly all places are empty; the few that are not look like what attempts have taught.
+        """
+        assert isinstance(grasping.backbone, RectifiedBackbone)
+        chosen = torch.randint(len(self.beyond_reach), (len(images),), generator=rng).to(images.device)
+        rows, columns = self.beyond_reach[chosen, :, None].unbind(1)
+        patch = torch.arange(2 * self._margin + 1, device=images.device)
+        grid = self.view.grid[(rows + patch)[:, :, None], (columns + patch)[:, None, :]]
+        logits = grasping.backbone.on_map(self.view.at(images, grid), members=1)
+        return functional.softplus(logits).mean()
 
 
 def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:

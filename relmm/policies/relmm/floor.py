@@ -48,5 +48,8 @@ class FloorView(nn.Module):
         Returns:
             -1..1, and 0 for what is out of view, (batch, channels, rows, columns).
         """
-        grid = self.grid.expand(len(images), -1, -1, -1)
+        return self.at(images, self.grid.expand(len(images), -1, -1, -1))
+
+    def at(self, images: Tensor, grid: Tensor) -> Tensor:
+        """The same for other parts of `grid`, one of each picture, (batch, h, w, 2) -> (batch, channels, h, w)."""
         return functional.grid_sample(images * 2 - 1, grid, mode="bilinear", align_corners=False)

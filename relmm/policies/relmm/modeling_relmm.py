@@ -13,7 +13,7 @@ from torch import Tensor
 from relmm.features import ACTION_NAMES, IMAGE_KEY, MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict, xy_to_cell
 from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
-from relmm.policies.relmm.encoders import make_observer
+from relmm.policies.relmm.encoders import FloorObserver, make_observer
 from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch
 from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
@@ -121,11 +121,11 @@ class ReLMMPolicy(ControllerPolicy):
         """
         skills = batch["action"][:, 0, _SKILL].round().long()
         attempts, steps = skills == Skill.GRASP, _drives(batch, skills)
-        losses, logs = [self._no_loss()], {}
+        losses = [self._no_loss()]
+        logs: dict[str, Any] = {}
         if attempts.any():
-            grasp_loss = self.grasping.loss(*_attempts(batch, attempts))
+            grasp_loss, logs = self.grasp_loss(*_attempts(batch, attempts), batch[IMAGE_KEY][:, 0], self.rng)
             losses.append(grasp_loss)
-            logs["grasp_loss"] = grasp_loss.item()
         if steps.any():
             navigation_batch = self._navigation_batch(batch, steps)
             noise = torch.randn(2, int(steps.sum()), ACTIONS, device=batch["action"].device)
@@ -133,6 +133,24 @@ class ReLMMPolicy(ControllerPolicy):
             losses.append(navigation_loss)
             logs |= navigation_logs
         return torch.stack(losses).sum(), logs
+
+    def grasp_loss(
+        self, images: Tensor, cells: Tensor, successes: Tensor, others: Tensor, rng: torch.Generator
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The loss of the ensemble, and the mean of the members' cross-entropies for logs.
+
+        Args:
+            images: before the attempts, as in `GraspEnsemble.loss`.
+            cells: attempted.
+            successes: 0 or 1.
+            others: any pictures 0..1, (batch, 3, 100, 100), whose floor beyond the arm's reach is mostly empty.
+            rng: chooses places in them.
+        """
+        loss = self.grasping.loss(images, cells, successes)
+        logs = {"grasp_loss": loss.item() / self.config.num_members}
+        if isinstance(self.observer, FloorObserver) and self.config.background_weight > 0:
+            loss = loss + self.config.background_weight * self.observer.background_loss(others, self.grasping, rng)
+        return loss, logs
 
     def update(self) -> None:
         """Called after each step of the optimiser."""

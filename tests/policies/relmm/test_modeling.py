@@ -389,16 +389,19 @@ def test_forward_learns_attempts_with_the_loss_of_the_ensemble(green: ReLMMPolic
     episode = make_episode(draw, *"dffsp")
     loss, logs = green.forward(as_batch(green, episode, [1, 3, 4]))
     pictures = torch.cat([green.to_pictures(episode[frame][0]) for frame in (1, 3)])
-    expected = green.grasping.loss(pictures, torch.tensor([40, 112]), torch.tensor([0.0, 1.0])).item()
-    assert loss.item() == pytest.approx(expected)
-    assert logs == {"grasp_loss": pytest.approx(expected)}
+    attempts = green.grasping.loss(pictures, torch.tensor([40, 112]), torch.tensor([0.0, 1.0])).item()
+    assert logs == {"grasp_loss": pytest.approx(attempts / green.config.num_members)}
+    rng = torch.Generator().manual_seed(0)
+    others = torch.cat([green.to_pictures(episode[frame][0]) for frame in (1, 3, 4)])
+    background = green.observer.background_loss(others, green.grasping, rng).item()
+    assert loss.item() == pytest.approx(attempts + green.config.background_weight * background, rel=1e-3)
 
 
 def test_forward_adds_both_losses_and_update_moves_the_targets(make_policy_of: MakePolicy, draw) -> None:
-    policy, episode = make_policy_of(seed=1), make_episode(draw, *"dfdfs")
+    policy, episode = make_policy_of(seed=1, background_weight=0.0), make_episode(draw, *"dfdfs")
     batch = as_batch(policy, episode, range(5))
     loss, logs = policy.forward(batch)
-    parts = logs["grasp_loss"] + logs["critic_loss"] + logs["actor_loss"]
+    parts = logs["grasp_loss"] * policy.config.num_members + logs["critic_loss"] + logs["actor_loss"]
     entropy_gap = -logs["entropy"] + policy.config.target_entropy
     assert loss.item() == pytest.approx(parts - logs["temperature"] * entropy_gap, rel=1e-4)
     loss.backward()
