@@ -158,11 +158,11 @@ class Replay:
         return self._pictures[frames % self.capacity]
 
     def trails(self, frames: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Where the robot had just been, `Trail.features`, (n, 15)."""
+        """Where the robot had just been, `Trail.features`, (n, 21)."""
         return self._trails[frames % self.capacity]
 
     def next_trail(self, motion: tuple[float, float]) -> NDArray[np.float32]:
-        """The trail of a step of the policy that would come next, for an observation with this motion, (15,)."""
+        """The trail of a step of the policy that would come next, for an observation with this motion, (21,)."""
         return (Trail() if self._resetting else self._trail_here(motion)).features()
 
     def _trail_here(self, motion: tuple[float, float]) -> Trail:

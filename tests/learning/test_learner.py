@@ -1,8 +1,7 @@
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
 import relmm.plugin  # noqa: F401
-from relmm.features import FPS, GRID, IMAGE_KEY, STATE_KEY, Phase, Skill, cell_to_xy
+from relmm.features import FPS, GRID, IMAGE_KEY, Phase, Skill, cell_to_xy
 from relmm.geometry import CAMERAS
 from relmm.learning.learner import Learner
 from relmm.learning.maps import to_pictures
@@ -23,6 +22,7 @@ from relmm.learning.replay import Replay
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.policies.relmm.trail import HISTORY
 
 SKILLS = {"d": Skill.NAVIGATE, "r": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
 SMALL = {"grasp_batch_size": 8, "navigation_batch_size": 8, "min_attempts_to_update": 3, "min_steps_to_update": 3}
@@ -274,10 +274,11 @@ def test_frozen_ensemble_learns_from_recorded_curricula_only(make_learner, recor
 
 
 def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> None:
-    """LeRobot's dataset, batches and preprocessor against the replay, but for the trails that single frames lack."""
-    policy = make_policy(refreshed_maps=0, background_weight=0.0, seed=2)
+    """LeRobot's dataset, batches and preprocessor against the replay, for odometry that agrees with the actions."""
+    policy = make_policy(refreshed_maps=0, background_weight=0.0, conservative_weight=0.0, seed=2)
     deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
-    columns = dict.fromkeys((IMAGE_KEY, "action", "next.reward"), deltas)
+    columns = dict.fromkeys((IMAGE_KEY, "next.reward"), deltas)
+    columns["action"] = [delta / FPS for delta in policy.config.action_delta_indices]
     frames = list(LeRobotDataset("local/diverse", root=RECORDED, delta_timestamps=columns, episodes=[0, 1, 2]))
     learner, episode = Learner(policy, Replay(len(frames)), seed=0), 0
     for frame in frames:
@@ -285,34 +286,26 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
             learner.replay.save_episode()
         episode = frame["episode_index"]
         picture = (frame[IMAGE_KEY][0] * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
-        phase = int(frame["complementary_info.phase"])
-        motion, success = frame[STATE_KEY][:2].tolist(), bool(frame["next.reward"][0] > 0)
-        learner.replay.add(picture, motion, frame["action"][0], success, phase)
+        success = bool(frame["next.reward"][0] > 0)
+        motion, action = frame["action"][HISTORY - 1, :2].tolist(), frame["action"][HISTORY]
+        learner.replay.add(picture, motion, action, success, Phase.LEARNING)
     learner.replay.save_episode()
     policy.eval()
 
-    # The replay leaves out the last drive of a pseudo-reset, because it leads to an empty trail.
-    phases = [int(frame["complementary_info.phase"]) for frame in frames] + [Phase.LEARNING]
-    last = [here == Phase.PSEUDO_RESET != after for here, after in itertools.pairwise(phases)]
-    taken = [frame for frame, left_out in zip(frames, last, strict=True) if not left_out]
-    batch = make_pre_post_processors(policy.config)[0](default_collate(taken))
+    batch = make_pre_post_processors(policy.config)[0](default_collate(frames))
     torch.manual_seed(3)
     loss, logs = policy.forward(batch)
 
     replay = learner.replay
-    every = [table.rows(np.arange(len(table))) for table in (replay.steps, replay.pseudo_reset_steps)]
-    rows = {name: np.concatenate([part[name] for part in every]) for name in every[0]}
-    order = np.argsort(rows["frame"])
-    steps = learner.navigation_batch({name: column[order] for name, column in rows.items()})
+    steps = learner.navigation_batch(replay.steps.rows(np.arange(len(replay.steps))))
     assert steps.trails.any()
-    steps = replace(steps, trails=torch.zeros_like(steps.trails), next_trails=torch.zeros_like(steps.trails))
     torch.manual_seed(3)
-    navigation_loss, wanted = policy.navigation.loss(steps, torch.randn(2, len(order), 2))
+    navigation_loss, wanted = policy.navigation.loss(steps, torch.randn(2, len(replay.steps), 2))
     pictures = to_pictures(replay.pictures(replay.attempts["frame"]), torch.device("cpu"))
     cells, successes = (torch.from_numpy(replay.attempts[name]) for name in ("cell", "success"))
     grasp_loss = policy.grasping.loss(pictures, cells, successes)
     assert successes.any()
-    assert len(order) > 20
+    assert len(replay.steps) > 20
     assert logs == pytest.approx({"grasp_loss": grasp_loss.item() / policy.config.num_members, **wanted}, rel=1e-3)
     assert loss.item() == pytest.approx((grasp_loss + navigation_loss).item(), rel=1e-3)
 

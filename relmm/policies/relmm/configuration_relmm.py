@@ -12,6 +12,7 @@ from lerobot.optim.optimizers import AdamConfig
 from relmm.errors import ConfigError
 from relmm.geometry import camera_geometry
 from relmm.policies.controller import ControllerConfig
+from relmm.policies.relmm.trail import HISTORY
 
 GRASP_BACKBONES = ("rectified", "dense")
 NAVIGATION_ENCODERS = ("floor", "paper", "paper_small")
@@ -66,6 +67,7 @@ class ReLMMConfig(ControllerConfig):
         target_entropy: of SAC's temperature.
         initial_temperature: of SAC.
         clip_targets: keep Bellman targets within what rewards of -1 to 0 allow.
+        conservative_weight: of conservative Q-learning in `forward`, that is, when LeRobot trains from a dataset alone.
         mirror: learn from mirrored maps of the floor, too.
         refreshed_maps: frames per update whose stored grasp map and P[grasp] are computed anew by the current ensemble,
             the most outdated of the batch first; 0 for the whole batch.
@@ -117,6 +119,7 @@ class ReLMMConfig(ControllerConfig):
     target_entropy: float = -2.0
     initial_temperature: float = 0.1
     clip_targets: bool = True
+    conservative_weight: float = 0.5
     mirror: bool = True
     refreshed_maps: int = 6
 
@@ -144,8 +147,8 @@ class ReLMMConfig(ControllerConfig):
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """As the observations."""
-        return self.observation_delta_indices
+        """As the observations, and those before, which tell where the robot has just been."""
+        return [*range(-HISTORY, 0), *self.observation_delta_indices]
 
     @property
     def reward_delta_indices(self) -> list[int]:
@@ -195,6 +198,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "target_entropy": (-100, 100),
     "initial_temperature": (_TINY, math.inf),
     "pseudo_reset_share": (0, 0.9),
+    "conservative_weight": (0, math.inf),
     "refreshed_maps": (0, math.inf),
 }
 

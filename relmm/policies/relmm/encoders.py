@@ -67,8 +67,7 @@ class FloorObserver(nn.Module):
         self.register_buffer("known", known, persistent=False)
         beyond = known.clone()
         beyond[: GRID - row] = False
-        self.beyond_reach: Tensor
-        self.register_buffer("beyond_reach", beyond.nonzero(), persistent=False)  # (n, 2)
+        self._places: tuple[Tensor, Tensor] = known.nonzero(), beyond.nonzero()  # (n, 2)
 
     @torch.no_grad()
     def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
@@ -81,19 +80,25 @@ class FloorObserver(nn.Module):
         colours = functional.avg_pool2d(inner, _CELLS) / 2 + 0.5
         return (torch.cat([graspable[:, None], colours], dim=1) * 255).round().to(torch.uint8)
 
-    def background_loss(self, images: Tensor, grasping: GraspEnsemble, rng: torch.Generator) -> Tensor:
-        """Cross-entropy of "nothing to grasp here" at one random place beyond the arm's reach in each picture.
+    def background_loss(
+        self, images: Tensor, grasping: GraspEnsemble, rng: torch.Generator, offline: bool = False
+    ) -> Tensor:
+        """Cross-entropy of "nothing to grasp here" at one random place in each picture.
 
         No attempt is ever made at walls or furniture, so the network that draws the map would answer there as it
-        pleases. Nearly all places are empty; the few that are not look like what attempts have taught.
+        pleases. Nearly all places are empty; the few that are not look like what attempts have taught. A robot that
+        learns while it acts finds out about what is in reach, so places beyond it are enough, and the map's member.
+        `offline`, who recorded the data may never have failed, and all members learn from all places.
         """
         assert isinstance(grasping.backbone, RectifiedBackbone)
-        chosen = torch.randint(len(self.beyond_reach), (len(images),), generator=rng).to(images.device)
-        rows, columns = self.beyond_reach[chosen, :, None].unbind(1)
+        everywhere, beyond = self._places
+        places = everywhere if offline else beyond
+        chosen = places[torch.randint(len(places), (len(images),), generator=rng)].to(images.device)
+        rows, columns = chosen[:, :, None].unbind(1)
         patch = torch.arange(2 * self._margin + 1, device=images.device)
         grid = self.view.grid[(rows + patch)[:, :, None], (columns + patch)[:, None, :]]
-        logits = grasping.backbone.on_map(self.view.at(images, grid), members=1)
-        return functional.softplus(logits).mean()
+        logits = grasping.backbone.on_map(self.view.at(images, grid), members=None if offline else 1)
+        return functional.softplus(logits).flatten(1).mean(dim=1).sum()
 
 
 def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
@@ -159,7 +164,7 @@ class Encoder(nn.Module):
 
         Args:
             observations: uint8, (batch, channels, height, width).
-            trails: where the robot has just been, `Trail.features`, (batch, 15).
+            trails: where the robot has just been, `Trail.features`, (batch, 21).
         """
         scaled = observations.float() / 127.5 - 1
         encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import FloorObserver, make_observer
 from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch
-from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
+from relmm.policies.relmm.trail import HISTORY, TRAIL_FEATURES, Trail
 
 _SKILL = ACTION_NAMES.index("skill.pos")
 _PLACE = slice(ACTION_NAMES.index("skill_x.pos"), ACTION_NAMES.index("skill_y.pos") + 1)
@@ -115,27 +116,37 @@ class ReLMMPolicy(ControllerPolicy):
         """The losses of the frames of a LeRobot batch: attempts teach the ensemble, navigation steps the navigation.
 
         Args:
-            batch: pictures (batch, time, 3, 100, 100) 0..1, `action` (batch, time, 5) and `next.reward` (batch, time),
-                where time is `config.observation_delta_indices`; the rest is not used.
+            batch: pictures (batch, time, 3, 100, 100) 0..1, `action` (batch, history + time, 5) and `next.reward`
+                (batch, time), where time is `config.observation_delta_indices`; which of them are padding.
             **kwargs: LeRobot's, not used.
         """
+        trails = _trails(batch)
+        batch = {**batch, "action": batch["action"][:, HISTORY:]}
         skills = batch["action"][:, 0, _SKILL].round().long()
         attempts, steps = skills == Skill.GRASP, _drives(batch, skills)
         losses = [self._no_loss()]
         logs: dict[str, Any] = {}
         if attempts.any():
-            grasp_loss, logs = self.grasp_loss(*_attempts(batch, attempts), batch[IMAGE_KEY][:, 0], self.rng)
+            others = batch[IMAGE_KEY][:, 0]
+            grasp_loss, logs = self.grasp_loss(*_attempts(batch, attempts), others, self.rng, offline=True)
             losses.append(grasp_loss)
         if steps.any():
-            navigation_batch = self._navigation_batch(batch, steps)
+            navigation_batch = self._navigation_batch(batch, steps, trails[:, steps])
             noise = torch.randn(2, int(steps.sum()), ACTIONS, device=batch["action"].device)
-            navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise)
+            conservatism = self.config.conservative_weight
+            navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise, conservatism)
             losses.append(navigation_loss)
             logs |= navigation_logs
         return torch.stack(losses).sum(), logs
 
     def grasp_loss(
-        self, images: Tensor, cells: Tensor, successes: Tensor, others: Tensor, rng: torch.Generator
+        self,
+        images: Tensor,
+        cells: Tensor,
+        successes: Tensor,
+        others: Tensor,
+        rng: torch.Generator,
+        offline: bool = False,
     ) -> tuple[Tensor, dict[str, float]]:
         """The loss of the ensemble, and the mean of the members' cross-entropies for logs.
 
@@ -145,11 +156,13 @@ class ReLMMPolicy(ControllerPolicy):
             successes: 0 or 1.
             others: any pictures 0..1, (batch, 3, 100, 100), whose floor beyond the arm's reach is mostly empty.
             rng: chooses places in them.
+            offline: nobody will try the other places; see `FloorObserver.background_loss`.
         """
         loss = self.grasping.loss(images, cells, successes)
         logs = {"grasp_loss": loss.item() / self.config.num_members}
         if isinstance(self.observer, FloorObserver) and self.config.background_weight > 0:
-            loss = loss + self.config.background_weight * self.observer.background_loss(others, self.grasping, rng)
+            background = self.observer.background_loss(others, self.grasping, rng, offline)
+            loss = loss + self.config.background_weight * background
         return loss, logs
 
     def update(self) -> None:
@@ -178,7 +191,7 @@ class ReLMMPolicy(ControllerPolicy):
         continues = batch.continues * (1 - chance) if self.config.relabel_terminal else batch.continues
         return replace(batch, rewards=batch.rewards + chance, continues=continues)
 
-    def _navigation_batch(self, batch: dict[str, Any], steps: Tensor) -> NavigationBatch:
+    def _navigation_batch(self, batch: dict[str, Any], steps: Tensor, trails: Tensor) -> NavigationBatch:
         pictures, actions = batch[IMAGE_KEY][steps], batch["action"][steps]
         attempted = actions[:, 1:, _SKILL].round() == Skill.GRASP
         # Only attempts that follow the step without another step between them are its outcome.
@@ -189,15 +202,13 @@ class ReLMMPolicy(ControllerPolicy):
         after = torch.where(_padded(batch, steps).gather(1, after[:, None]).squeeze(1), 1, after)
         rows = torch.arange(len(pictures), device=pictures.device)
         following = pictures[rows, after]
-        # Single frames know nothing of before: a robot that has just begun.
-        trails = torch.zeros(len(pictures), TRAIL_FEATURES, device=pictures.device)
         result = NavigationBatch(
             self.observer(pictures[:, 0], self.grasping),
-            trails,
+            trails[0],
             from_navigation_steps(actions[:, 0]),
             success.float() - 1,
             self.observer(following, self.grasping),
-            trails,
+            trails[1],
             1 - success.float(),
         )
         probabilities = self.grasping.grasp_probability(self.grasping.estimate(following))
@@ -221,6 +232,27 @@ def _drives(batch: dict[str, Any], skills: Tensor) -> Tensor:
     """Which frames are navigation steps whose next picture is in the batch, (batch,) bool."""
     drives = skills == Skill.NAVIGATE
     return drives & ~_padded(batch, drives.new_ones(len(drives)))[:, 1]
+
+
+def _trails(batch: dict[str, Any]) -> Tensor:
+    """Where the robot had been before each frame, and if it drives, after it, (2, batch, 21).
+
+    From the actions of the frames before; the turns of collision avoidance, which only the odometry has, are missing.
+    """
+    actions: Tensor = batch["action"]
+    unknown: Tensor = batch.get("action_is_pad", torch.zeros(actions.shape[:2], dtype=torch.bool))
+    features = np.empty((2, len(actions), TRAIL_FEATURES), np.float32)
+    for row, (steps, padded) in enumerate(zip(actions.tolist(), unknown.tolist(), strict=True)):
+        trail = Trail()
+        for x_vel, theta_vel, skill, *_ in itertools.compress(steps[:HISTORY], np.logical_not(padded)):
+            if round(skill) == Skill.PLACE:
+                trail.reset()
+            elif round(skill) == Skill.NAVIGATE:
+                trail.moved(x_vel, theta_vel)
+        features[0, row] = trail.features()
+        trail.moved(*steps[HISTORY][:2])
+        features[1, row] = trail.features()
+    return torch.from_numpy(features).to(actions.device)
 
 
 def _padded(batch: dict[str, Any], rows: Tensor) -> Tensor:

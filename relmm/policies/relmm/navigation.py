@@ -16,6 +16,7 @@ from relmm.policies.relmm.trail import MIRROR
 
 ACTIONS = 2  # forward and turn, each -1..1
 _LOG_STD_RANGE = (-5.0, 2.0)
+_UNIFORM_ACTIONS = 10  # that conservative Q-learning compares the taken one with
 
 
 @dataclass
@@ -24,7 +25,7 @@ class NavigationBatch:
 
     Attributes:
         observations, next_observations: uint8, (batch, channels, height, width).
-        trails, next_trails: where the robot had just been, `Trail.features`, (batch, 15).
+        trails, next_trails: where the robot had just been, `Trail.features`, (batch, 21).
         actions: -1..1, (batch, 2).
         rewards: -1..0, (batch,).
         continues: 1 where the search goes on, 0 after a success, or the probability of that, (batch,).
@@ -140,12 +141,13 @@ class Navigation(nn.Module):
             noise = torch.randn(len(observations), ACTIONS, generator=rng).to(features.device)
             return self.actor.sample(features, noise)[0]
 
-    def loss(self, batch: NavigationBatch, noise: Tensor) -> tuple[Tensor, dict[str, float]]:
+    def loss(self, batch: NavigationBatch, noise: Tensor, conservatism: float = 0.0) -> tuple[Tensor, dict[str, float]]:
         """The sum of the critics', the actor's and the temperature's loss; none has gradients in another's weights.
 
         Args:
             batch: navigation steps.
             noise: standard normal, (2, batch, 2): for the actions at this and at the next observation.
+            conservatism: weight of conservative Q-learning, for steps that nobody can try out again.
 
         Returns:
             The loss and its parts, for logs.
@@ -155,6 +157,8 @@ class Navigation(nn.Module):
         features = self.critics.encode(batch.observations, batch.trails)
         values = self.critics(features, batch.actions)
         critic_loss = functional.mse_loss(values, targets.expand_as(values))
+        if conservatism > 0:
+            critic_loss = critic_loss + conservatism * self._overestimate(features, values)
 
         actions, log_density = self.actor.sample(
             self._actor_features(batch.observations, batch.trails, features), noise[0]
@@ -175,6 +179,12 @@ class Navigation(nn.Module):
             "value": values.detach().mean().item(),
         }
         return critic_loss + actor_loss + temperature_loss, logs
+
+    def _overestimate(self, features: list[Tensor], values: Tensor) -> Tensor:
+        """How much better any action seems than the one that was taken (Kumar et al. 2020, CQL(H)), by uniform ones."""
+        uniform = torch.rand(_UNIFORM_ACTIONS, len(features[0]), ACTIONS, device=values.device) * 2 - 1
+        others = torch.stack([self.critics(features, actions) for actions in uniform])
+        return (others.logsumexp(dim=0) - math.log(_UNIFORM_ACTIONS) - values).mean()
 
     @torch.no_grad()
     def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:

@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 
 from relmm.features import DRIVE_PULSE_S
 
-_LAGS = (1, 2, 4, 8, 16)  # navigation steps; turning round takes 14
+# Navigation steps; turning round takes 14. Odd ones too, or turning left and right by turns would look like standing
+# still.
+_LAGS = (1, 2, 3, 5, 9, 17, 33)
+HISTORY = max(_LAGS)
 _MAX_TURNS = 2.0  # turns to either side that still make a difference
 
 TRAIL_FEATURES = 3 * len(_LAGS)
@@ -26,7 +29,7 @@ class Trail:
     """The robot's poses after its last navigation steps, as seen from where it is now."""
 
     def __init__(self) -> None:
-        self._poses: deque[tuple[float, float, float]] = deque(maxlen=max(_LAGS) + 1)
+        self._poses: deque[tuple[float, float, float]] = deque(maxlen=HISTORY + 1)
         self.reset()
 
     def reset(self) -> None:
@@ -48,7 +51,7 @@ class Trail:
         self._poses.append((x + forward * math.cos(middle), y + forward * math.sin(middle), heading + turn))
 
     def features(self) -> NDArray[np.float32]:
-        """Forward and left (m) and the turn (half turns, at most 2 either way) of earlier poses, (15,)."""
+        """Forward and left (m) and the turn (half turns, at most 2 either way) of earlier poses, (21,)."""
         x, y, heading = self._poses[-1]
         cos, sin = math.cos(heading), math.sin(heading)
         values: list[float] = []

@@ -311,14 +311,21 @@ DRIVE = action_dict(x_vel=0.3, theta_vel=-40.0)
 
 
 def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> dict[str, Tensor]:
-    """What LeRobot's dataset gives for some frames: beyond the episode's end, its last frame again."""
-    wanted = [[frame + delta for delta in policy.config.observation_delta_indices] for frame in frames]
-    rows = [[episode[min(index, len(episode) - 1)] for index in row] for row in wanted]
+    """What LeRobot's dataset gives for some frames: beyond the episode's ends, its first or last frame again."""
+
+    def look(deltas: list[int]) -> tuple[list[list[Frame]], Tensor]:
+        wanted = [[frame + delta for delta in deltas] for frame in frames]
+        rows = [[episode[min(max(index, 0), len(episode) - 1)] for index in row] for row in wanted]
+        return rows, torch.tensor([[not 0 <= index < len(episode) for index in row] for row in wanted])
+
+    rows, padded = look(policy.config.observation_delta_indices)
+    action_rows, action_padded = look(policy.config.action_delta_indices)
     return {
         IMAGE_KEY: torch.from_numpy(np.stack([[f[0] for f in row] for row in rows])).permute(0, 1, 4, 2, 3) / 255,
-        "action": torch.tensor([[[f[1][name] for name in ACTION_NAMES] for f in row] for row in rows]),
+        "action": torch.tensor([[[f[1][name] for name in ACTION_NAMES] for f in row] for row in action_rows]),
         "next.reward": torch.tensor([[f[2] for f in row] for row in rows]),
-        f"{IMAGE_KEY}_is_pad": torch.tensor([[index >= len(episode) for index in row] for row in wanted]),
+        f"{IMAGE_KEY}_is_pad": padded,
+        "action_is_pad": action_padded,
     }
 
 
@@ -340,14 +347,15 @@ def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, succes
     pictures = torch.cat([policy.to_pictures(episode[frame][0]) for frame in (0, after)])
     chance = 0.0 if success else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
     observations = policy.observer(pictures, policy.grasping)
-    unknown = torch.zeros(1, TRAIL_FEATURES)
+    trail = Trail()
+    trail.moved(DRIVE["x.vel"], DRIVE["theta.vel"])
     return NavigationBatch(
         observations[:1],
-        unknown,
+        torch.zeros(1, TRAIL_FEATURES),
         from_navigation_steps(torch.tensor([list(DRIVE.values())])),
         torch.tensor([0.0 if success else chance - 1]),
         observations[1:],
-        unknown,
+        torch.from_numpy(trail.features()[None]),
         torch.tensor([0.0 if success else 1 - chance]),
     )
 
@@ -373,7 +381,8 @@ def test_forward_learns_a_drive_as_the_replay_knows_it(outcomes, after, success,
     torch.manual_seed(7)
     loss, logs = green.forward(as_batch(green, episode, [0]))
     torch.manual_seed(7)
-    expected, wanted = green.navigation.loss(expected_batch(green, episode, after, success), torch.randn(2, 1, 2))
+    batch, noise = expected_batch(green, episode, after, success), torch.randn(2, 1, 2)
+    expected, wanted = green.navigation.loss(batch, noise, green.config.conservative_weight)
     assert loss.item() == pytest.approx(expected.item(), rel=1e-4)
     assert logs == pytest.approx(wanted, rel=1e-4)
 
@@ -393,12 +402,13 @@ def test_forward_learns_attempts_with_the_loss_of_the_ensemble(green: ReLMMPolic
     assert logs == {"grasp_loss": pytest.approx(attempts / green.config.num_members)}
     rng = torch.Generator().manual_seed(0)
     others = torch.cat([green.to_pictures(episode[frame][0]) for frame in (1, 3, 4)])
-    background = green.observer.background_loss(others, green.grasping, rng).item()
+    background = green.observer.background_loss(others, green.grasping, rng, offline=True).item()
     assert loss.item() == pytest.approx(attempts + green.config.background_weight * background, rel=1e-3)
 
 
 def test_forward_adds_both_losses_and_update_moves_the_targets(make_policy_of: MakePolicy, draw) -> None:
-    policy, episode = make_policy_of(seed=1, background_weight=0.0), make_episode(draw, *"dfdfs")
+    policy = make_policy_of(seed=1, background_weight=0.0, conservative_weight=0.0)
+    episode = make_episode(draw, *"dfdfs")
     batch = as_batch(policy, episode, range(5))
     loss, logs = policy.forward(batch)
     parts = logs["grasp_loss"] * policy.config.num_members + logs["critic_loss"] + logs["actor_loss"]

@@ -160,6 +160,20 @@ def test_loss_is_the_sum_of_the_three_of_sac(kind: str, make_navigation: MakeNav
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_conservatism_adds_what_uniform_actions_seem_better_by(kind: str, make_navigation: MakeNavigation) -> None:
+    navigation, batch, noise = make_navigation(kind), make_batch(kind), make_noise()
+    plain = navigation.loss(batch, noise)[0].item()
+    torch.manual_seed(5)
+    loss = navigation.loss(batch, noise, conservatism=0.7)[0].item()
+    torch.manual_seed(5)
+    critics = navigation.critics
+    features = critics.encode(batch.observations, batch.trails)
+    others = torch.stack([critics(features, actions) for actions in torch.rand(10, SIZE, 2) * 2 - 1])
+    gap = others.exp().mean(dim=0).log() - critics(features, batch.actions)
+    assert loss - plain == pytest.approx(0.7 * gap.mean().item())
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_each_part_learns_from_its_own_loss_alone(kind: str, make_navigation: MakeNavigation) -> None:
     """The slope of the whole loss along any weight is that of one part, the others held fast."""
     navigation, batch, noise = make_navigation(kind, clip_targets=False), make_batch(kind), make_noise()

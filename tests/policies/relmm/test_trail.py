@@ -8,7 +8,7 @@ import pytest
 from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL, MAX_X_VEL
 from relmm.policies.relmm.trail import MIRROR, TRAIL_FEATURES, Trail
 
-LAGS = (1, 2, 4, 8, 16)
+LAGS = (1, 2, 3, 5, 9, 17, 33)
 STEP = MAX_X_VEL * DRIVE_PULSE_S  # m
 TURN = MAX_THETA_VEL * DRIVE_PULSE_S / 180  # half turns
 
@@ -75,7 +75,7 @@ def test_turns_are_limited_to_either_side(side: int) -> None:
 
 
 def test_what_is_older_than_the_longest_lag_is_forgotten() -> None:
-    recent = [(0.3, 40.0), (0.1, -70.0)] * 8
+    recent = [(0.3, 40.0), (0.1, -70.0)] * 17
     assert after(*[(0.4, 45.0)] * 400, *recent) == pytest.approx(after(*recent), abs=1e-5)
 
 
