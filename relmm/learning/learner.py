@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from relmm.features import Phase
-from relmm.learning.maps import Maps, to_pictures
-from relmm.learning.replay import Replay
+from relmm.learning.replay import Replay, to_pictures
+from relmm.policies.relmm.maps import Maps
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 from relmm.policies.relmm.navigation import ACTIONS, NavigationBatch
 
@@ -54,7 +54,7 @@ class Learner:
 
     def __init__(self, policy: ReLMMPolicy, replay: Replay, seed: int) -> None:
         self.policy, self.replay, self.config = policy, replay, policy.config
-        self.maps = Maps(policy, replay)
+        self.maps = Maps(policy.observer, policy.grasping, replay.capacity)
         self.rng = np.random.default_rng(seed)
         self.noise = torch.Generator().manual_seed(seed)
         grasping, navigation = policy.get_optim_params()
@@ -87,10 +87,10 @@ class Learner:
         attempts = self.replay.attempts
         rows = self.replay.sample(attempts, self.config.grasp_batch_size, self.rng)
         device = self.policy.weights_device
-        pictures = to_pictures(self.replay.pictures(attempts["frame"][rows]), device)
+        pictures = self._pictures(attempts["frame"][rows])
         cells = torch.from_numpy(attempts["cell"][rows]).to(device)
         successes = torch.from_numpy(attempts["success"][rows]).to(device)
-        others = to_pictures(self.replay.pictures(self.replay.sample_frames(len(rows), self.rng)), device)
+        others = self._pictures(self.replay.sample_frames(len(rows), self.rng))
         return self.policy.grasp_loss(pictures, cells, successes, others, self.noise)
 
     # --- Recorded episodes --------------------------------------------------------------------------------
@@ -134,7 +134,9 @@ class Learner:
         device, count = self.policy.weights_device, len(steps["frame"])
         frames = np.concatenate([steps["frame"], steps["next"]])
         trails = torch.from_numpy(self.replay.trails(frames)).to(device)
-        observations, probabilities = self.maps.get(frames, self.config.refreshed_maps)
+        observations, probabilities = (
+            each.to(device) for each in self.maps.get(frames, self._pictures, self.config.refreshed_maps)
+        )
         success = torch.from_numpy(steps["success"]).to(device)
         actions = np.stack([steps["forward"], steps["turn"]], axis=1)
         batch = NavigationBatch(
@@ -147,6 +149,9 @@ class Learner:
             1 - success.float(),
         )
         return self.policy.relabel(batch, probabilities[count:], ~success)
+
+    def _pictures(self, frames: NDArray[np.int64]) -> torch.Tensor:
+        return to_pictures(self.replay.pictures(frames), self.policy.weights_device)
 
     def _step(self, module: str, loss: torch.Tensor, logs: dict[str, float]) -> None:
         optimizer = self.optimizers[module]

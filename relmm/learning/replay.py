@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from relmm.features import (
@@ -185,3 +186,8 @@ class Replay:
 
     def _first(self, table: Table) -> int:
         return int(np.searchsorted(table["frame"], self.frames - self.capacity))
+
+
+def to_pictures(pictures: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+    """Stored pictures as the networks take them: uint8 (n, 100, 100, 3) -> 0..1, (n, 3, 100, 100)."""
+    return torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2) / 255

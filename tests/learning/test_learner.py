@@ -17,8 +17,7 @@ import relmm.plugin  # noqa: F401
 from relmm.features import FPS, GRID, IMAGE_KEY, Phase, Skill, cell_to_xy
 from relmm.geometry import CAMERAS
 from relmm.learning.learner import Learner
-from relmm.learning.maps import to_pictures
-from relmm.learning.replay import Replay
+from relmm.learning.replay import Replay, to_pictures
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import torch
 
 from relmm.features import FRONT, GRID, MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES, Phase, Skill, action_dict
 from relmm.learning.actor import to_batch
-from relmm.learning.replay import Replay, Table
+from relmm.learning.replay import Replay, Table, to_pictures
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.trail import Trail
 
@@ -284,3 +285,9 @@ def test_tables_grow_beyond_their_first_size() -> None:
     assert len(table) == 3000
     assert table["number"].tolist() == list(range(3000))
     assert table.rows(np.array([0, 2999]))["half"].tolist() == [0.0, 1499.5]
+
+
+def test_pictures_are_what_the_networks_take(numbered: Callable[[int], np.ndarray]) -> None:
+    pictures = to_pictures(numbered(5)[None], torch.device("cpu"))
+    assert pictures.shape == (1, 3, 100, 100)
+    assert pictures[0, 1, 3, 4] == pytest.approx(numbered(5)[3, 4, 1] / 255)

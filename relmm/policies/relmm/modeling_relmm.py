@@ -16,9 +16,11 @@ from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import FloorObserver, make_observer
 from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
+from relmm.policies.relmm.maps import Maps
 from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch
 from relmm.policies.relmm.trail import HISTORY, TRAIL_FEATURES, Trail
 
+_REMEMBERED_FRAMES = 2**17  # 4 kB each, as they are met
 _SKILL = ACTION_NAMES.index("skill.pos")
 _PLACE = slice(ACTION_NAMES.index("skill_x.pos"), ACTION_NAMES.index("skill_y.pos") + 1)
 
@@ -47,6 +49,7 @@ class ReLMMPolicy(ControllerPolicy):
         self.rng = torch.Generator().manual_seed(config.seed or 0)
         self.sampling = config.sample
         self.estimate: Estimate | None = None
+        self._maps: Maps | None = None  # of the frames that `forward` has seen
 
     # --- Acting -------------------------------------------------------------------------------------------
     def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
@@ -130,6 +133,8 @@ class ReLMMPolicy(ControllerPolicy):
             others = batch[IMAGE_KEY][:, 0]
             grasp_loss, logs = self.grasp_loss(*_attempts(batch, attempts), others, self.rng, offline=True)
             losses.append(grasp_loss)
+            if self._maps is not None:
+                self._maps.version += 1
         if steps.any():
             navigation_batch = self._navigation_batch(batch, steps, trails[:, steps])
             noise = torch.randn(2, int(steps.sum()), ACTIONS, device=batch["action"].device)
@@ -201,18 +206,38 @@ class ReLMMPolicy(ControllerPolicy):
         # At the episode's end there is no step after the attempts: the picture before them is what the drive led to.
         after = torch.where(_padded(batch, steps).gather(1, after[:, None]).squeeze(1), 1, after)
         rows = torch.arange(len(pictures), device=pictures.device)
-        following = pictures[rows, after]
+        seen = torch.cat([pictures[:, 0], pictures[rows, after]])
+        numbers = None if "index" not in batch else torch.cat([batch["index"][steps], batch["index"][steps] + after])
+        observations, probabilities = self._see(seen, numbers)
+        count = len(pictures)
         result = NavigationBatch(
-            self.observer(pictures[:, 0], self.grasping),
+            observations[:count],
             trails[0],
             from_navigation_steps(actions[:, 0]),
             success.float() - 1,
-            self.observer(following, self.grasping),
+            observations[count:],
             trails[1],
             1 - success.float(),
         )
-        probabilities = self.grasping.grasp_probability(self.grasping.estimate(following))
-        return self.relabel(result, probabilities, ~success)
+        return self.relabel(result, probabilities[count:], ~success)
+
+    def _see(self, pictures: Tensor, numbers: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Observations and P[grasp] of pictures; of those with numbers, what earlier batches found out is kept."""
+        if numbers is None:
+            estimate = self.grasping.estimate(pictures)
+            return self.observer(pictures, self.grasping), self.grasping.grasp_probability(estimate)
+        if self._maps is None:
+            self._maps = Maps(self.observer, self.grasping, _REMEMBERED_FRAMES)
+        # Another dataset may have another picture of the same number.
+        checksums = (pictures * 255).double().round().flatten(1).sum(dim=1).long()
+        frames = (numbers + checksums * _REMEMBERED_FRAMES).cpu().numpy()
+        rows = {frame: row for row, frame in enumerate(frames.tolist())}
+
+        def find(wanted: NDArray[np.int64]) -> Tensor:
+            return pictures[[rows[frame] for frame in wanted.tolist()]]
+
+        observations, probabilities = self._maps.get(frames, find, self.config.refreshed_maps)
+        return observations.to(pictures.device), probabilities.to(pictures.device)
 
     def _no_loss(self) -> Tensor:
         return self.navigation.log_temperature * 0.0

@@ -420,3 +420,18 @@ def test_forward_adds_both_losses_and_update_moves_the_targets(make_policy_of: M
     before = target.clone()
     policy.update()
     assert not torch.equal(target, before)
+
+
+def test_forward_remembers_maps_by_number_but_not_those_of_another_dataset(green: ReLMMPolicy, draw) -> None:
+    """The same numbers with other pictures are other frames; the ensemble may have moved on meanwhile."""
+    losses = []
+    for life in ("dfds", "ddfs"):
+        batch = as_batch(green, make_episode(draw, *life), [0, 2])
+        for index in (None, torch.tensor([0, 2]), torch.tensor([0, 2])):
+            torch.manual_seed(7)
+            green.rng.manual_seed(7)
+            numbered = batch if index is None else {**batch, "index": index}
+            losses.append(green.forward(numbered)[0].item())
+    assert losses[0] == pytest.approx(losses[1]) == pytest.approx(losses[2])
+    assert losses[3] == pytest.approx(losses[4]) == pytest.approx(losses[5])
+    assert losses[0] != pytest.approx(losses[3])
