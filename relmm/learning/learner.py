@@ -137,7 +137,7 @@ class Learner:
         observations, probabilities = (
             each.to(device) for each in self.maps.get(frames, self._pictures, self.config.refreshed_maps)
         )
-        success = torch.from_numpy(steps["success"]).to(device)
+        success, attempted = (torch.from_numpy(steps[name]).to(device) for name in ("success", "attempted"))
         actions = np.stack([steps["forward"], steps["turn"]], axis=1)
         batch = NavigationBatch(
             observations[:count],
@@ -148,7 +148,7 @@ class Learner:
             trails[count:],
             1 - success.float(),
         )
-        return self.policy.relabel(batch, probabilities[count:], ~success)
+        return self.policy.relabel(batch, probabilities[count:], success, attempted)
 
     def _pictures(self, frames: NDArray[np.int64]) -> torch.Tensor:
         return to_pictures(self.replay.pictures(frames), self.policy.weights_device)

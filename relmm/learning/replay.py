@@ -66,7 +66,7 @@ class Replay:
     Attributes:
         attempts: `frame`, `cell`, `success`.
         steps: navigation steps: `frame`, `next` (frame of the picture after it), `forward` and `turn` (-1..1) and
-            `success`.
+            `success`, and whether grasps were `attempted` after it.
         pseudo_reset_steps: those of pseudo-resets, likewise.
         frames: how many have ever been added.
         episodes: how many have been completed.
@@ -76,7 +76,8 @@ class Replay:
         self.capacity = capacity
         self.frames = self.episodes = self.navigation_steps = 0
         self.attempts = Table(frame=np.int64, cell=np.int64, success=bool)
-        columns = {"frame": np.int64, "next": np.int64, "forward": np.float32, "turn": np.float32, "success": bool}
+        columns: dict[str, type] = {"frame": np.int64, "next": np.int64, "forward": np.float32, "turn": np.float32}
+        columns |= {"success": bool, "attempted": bool}
         self.steps, self.pseudo_reset_steps = Table(**columns), Table(**columns)
         self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)  # no memory until written to
         self._trails = np.zeros((capacity, TRAIL_FEATURES), np.float32)
@@ -144,7 +145,8 @@ class Replay:
 
     def _close_step(self, following: int, success: bool = False) -> None:
         if self._open_step is not None:
-            self._open_table.append(**self._open_step, next=following, success=success)
+            attempted = success or self._first_attempt is not None
+            self._open_table.append(**self._open_step, next=following, success=success, attempted=attempted)
         self._open_step = self._first_attempt = None
 
     # --- Reading ------------------------------------------------------------------------------------------

@@ -25,9 +25,11 @@ _DOWN = np.pi / 2  # rad, tool pitch
 # rad; folded a little tighter than the authors': the fingers and what they hold stay inside the base's circle, so that
 # the bumper meets a wall before they do, and out of the camera's view.
 REST_POSE = arm_inverse(0.15, 0.0, 0.15, pitch=1.3)
-PRESENT_POSE = arm_inverse(0.42, 0.0, 0.20, pitch=0.0)  # gripper level in front of the camera, floor far behind it
+# Before the camera, the floor far behind it; and no farther out than needed, or a wall behind an object would be in
+# the way of showing what could well be grasped.
+PRESENT_POSE = arm_inverse(0.32, 0.0, 0.20, pitch=0.3)
 # On the way there; straight from the floor to it the arm would swing 4 cm beyond both.
-_RAISED_POSE = arm_inverse(0.36, 0.0, 0.18, pitch=0.6)
+_RAISED_POSE = arm_inverse(0.30, 0.0, 0.16, pitch=1.0)
 _ABOVE_Z, _GRASP_Z, _PLACE_Z = 0.10, 0.014, 0.018  # m, of the point between the pads
 _IN_BASKET = arm_inverse(*BASKET_XY, 0.235, pitch=_DOWN)
 _OVER_BASKET = arm_inverse(*BASKET_XY, 0.31, pitch=_DOWN)

@@ -163,16 +163,17 @@ def test_equal_seeds_learn_the_same(make_learner) -> None:
 
 
 # --- Batches -------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("relabel", [False, True])
-def test_navigation_batch_is_that_of_its_frames(relabel: bool, make_learner, numbered) -> None:
-    learner = make_learner("dfdfs dfdss rrddd", relabel=relabel, refreshed_maps=0)
+@pytest.mark.parametrize(("relabel", "failed"), [(False, True), (True, True), (True, False)])
+def test_navigation_batch_is_that_of_its_frames(relabel: bool, failed: bool, make_learner, numbered) -> None:
+    learner = make_learner("dfdfs dfdss rrddd", relabel=relabel, relabel_failed=failed, refreshed_maps=0)
     policy, steps = learner.policy, learner.replay.steps
     batch = learner.navigation_batch(steps.rows(np.arange(len(steps))))
-    for row, (frame, after, success) in enumerate(zip(steps["frame"], steps["next"], steps["success"], strict=True)):
+    columns = (steps["frame"], steps["next"], steps["success"], steps["attempted"])
+    for row, (frame, after, success, attempted) in enumerate(zip(*columns, strict=True)):
         pictures = to_pictures(np.stack([numbered(frame), numbered(after)]), torch.device("cpu"))
         observations = policy.observer(pictures, policy.grasping).int()
         chance = policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
-        chance = 0.0 if success or not relabel else chance
+        chance = 0.0 if success or not relabel or (attempted and not failed) else chance
         assert (batch.observations[row].int() - observations[0]).abs().max() <= 1
         assert (batch.next_observations[row].int() - observations[1]).abs().max() <= 1
         trails = learner.replay.trails(np.array([frame, after]))

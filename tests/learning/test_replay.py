@@ -235,6 +235,17 @@ def test_placement_is_no_navigation_step(fill: Fill) -> None:
     assert fill(["dsp"]).navigation_steps == 1
 
 
+@pytest.mark.parametrize("life", [["dfdffddpds"], ["dsprrrd", "df", "d", "dfp"], random_life(3)])
+def test_replay_knows_after_which_steps_grasps_were_attempted(life: Life, fill: Fill) -> None:
+    frames = "".join(life)
+    ends = np.cumsum([len(episode) for episode in life]).tolist()
+    replay = fill(life)
+    for table in (replay.steps, replay.pseudo_reset_steps):
+        after = [int(frame) + 1 for frame in table["frame"]]
+        expected = [frame not in ends and frames[frame] in "fs" for frame in after]
+        assert table["attempted"].tolist() == expected
+
+
 def test_frames_are_taken_as_recorders_take_them(numbered) -> None:
     replay = Replay(10)
     drive = action_dict(x_vel=MAX_X_VEL, theta_vel=-MAX_THETA_VEL / 2)
@@ -244,7 +255,7 @@ def test_frames_are_taken_as_recorders_take_them(numbered) -> None:
         replay.add_frame(observation, action, outcome, "task")
     replay.save_episode()
     assert {name: values.tolist() for name, values in replay.steps.rows(np.array([0])).items()} == {
-        "frame": [0], "next": [1], "forward": [1.0], "turn": [-0.5], "success": [True]
+        "frame": [0], "next": [1], "forward": [1.0], "turn": [-0.5], "success": [True], "attempted": [True]
     }  # fmt: skip
     assert replay.attempts["cell"].tolist() == [17]
     driven = Trail()

@@ -55,6 +55,8 @@ class ReLMMConfig(ControllerConfig):
         navigation_encoder: `floor` (map of the floor with grasp probabilities), `paper` or `paper_small` (pictures).
         navigation_hidden: width of the dense layers.
         relabel: reward steps without success with the current P[grasp] - 1 instead of -1.
+        relabel_failed: also those whose attempts have failed. The ensemble sees what lies there, not the wall behind it
+            that keeps the arm away: a step that is rewarded against the evidence is taken for ever.
         relabel_terminal: a relabelled step also ends the search with probability P[grasp].
         pseudo_reset_share: of a navigation batch that is drawn from the drives of pseudo-resets, relabelled.
         navigation_learning_rate, navigation_batch_size: of SAC's optimiser.
@@ -106,6 +108,7 @@ class ReLMMConfig(ControllerConfig):
     navigation_encoder: str = "floor"
     navigation_hidden: int = 256
     relabel: bool = True
+    relabel_failed: bool = False
     relabel_terminal: bool = True
     pseudo_reset_share: float = 0.5
     navigation_learning_rate: float = 5e-4

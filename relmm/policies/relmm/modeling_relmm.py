@@ -182,17 +182,21 @@ class ReLMMPolicy(ControllerPolicy):
             {"params": navigation, "lr": self.config.navigation_learning_rate},
         ]
 
-    def relabel(self, batch: NavigationBatch, probabilities: Tensor, relabelled: Tensor) -> NavigationBatch:
+    def relabel(
+        self, batch: NavigationBatch, probabilities: Tensor, success: Tensor, attempted: Tensor
+    ) -> NavigationBatch:
         """Reward steps without success with what the current ensemble makes of where they led (paper 4.2).
 
         Args:
             batch: with rewards of -1 and 0.
             probabilities: P[grasp] at the next observations, (batch,).
-            relabelled: which steps, (batch,) bool.
+            success: which steps led to one, (batch,) bool.
+            attempted: after which steps grasps were attempted, (batch,) bool.
         """
         if not self.config.relabel:
             return batch
-        chance = torch.where(relabelled, probabilities, 0.0)
+        known = success if self.config.relabel_failed else success | attempted
+        chance = torch.where(known, 0.0, probabilities)
         continues = batch.continues * (1 - chance) if self.config.relabel_terminal else batch.continues
         return replace(batch, rewards=batch.rewards + chance, continues=continues)
 
@@ -219,7 +223,7 @@ class ReLMMPolicy(ControllerPolicy):
             trails[1],
             1 - success.float(),
         )
-        return self.relabel(result, probabilities[count:], ~success)
+        return self.relabel(result, probabilities[count:], success, own.any(dim=1))
 
     def _see(self, pictures: Tensor, numbers: Tensor | None) -> tuple[Tensor, Tensor]:
         """Observations and P[grasp] of pictures; of those with numbers, what earlier batches found out is kept."""

@@ -44,6 +44,7 @@ PAPER: dict[str, Any] = {
     "navigation_encoder": "paper",
     "navigation_hidden": 512,
     "relabel": True,
+    "relabel_failed": True,
     "relabel_terminal": False,
     "pseudo_reset_share": 0.0,
     "navigation_learning_rate": 3e-4,

@@ -281,25 +281,26 @@ def test_optimiser_gets_every_weight_but_those_of_averages_once(make_policy_of: 
 
 # --- Relabelling ---------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
-    ("relabel", "terminal", "rewards", "continues"),
+    ("relabel", "terminal", "failed", "rewards", "continues"),
     [
-        (True, True, [-0.7, -1.0, 0.0], [0.7, 1.0, 0.0]),
-        (True, False, [-0.7, -1.0, 0.0], [1.0, 1.0, 0.0]),
-        (False, True, [-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]),
+        (True, True, True, [-0.7, -1.0, 0.0, -0.6], [0.7, 1.0, 0.0, 0.6]),
+        (True, True, False, [-0.7, -1.0, 0.0, -1.0], [0.7, 1.0, 0.0, 1.0]),
+        (True, False, True, [-0.7, -1.0, 0.0, -0.6], [1.0, 1.0, 0.0, 1.0]),
+        (False, True, True, [-1.0, -1.0, 0.0, -1.0], [1.0, 1.0, 0.0, 1.0]),
     ],
 )
 def test_steps_without_success_are_rewarded_with_the_grasp_probability(
-    relabel: bool, terminal: bool, rewards: list[float], continues: list[float], make_policy_of: MakePolicy
+    relabel: bool, terminal: bool, failed: bool, rewards, continues, make_policy_of: MakePolicy
 ) -> None:
-    policy = make_policy_of("dense", relabel=relabel, relabel_terminal=terminal)
-    pictures = torch.zeros(3, 1, 1, 1, dtype=torch.uint8)
-    success = torch.tensor([0.0, 0.0, 1.0])
-    still, trails = torch.zeros(3, 2), torch.zeros(3, TRAIL_FEATURES)
+    policy = make_policy_of("dense", relabel=relabel, relabel_terminal=terminal, relabel_failed=failed)
+    pictures = torch.zeros(4, 1, 1, 1, dtype=torch.uint8)
+    success, attempted = torch.tensor([0.0, 0.0, 1.0, 0.0]), torch.tensor([False, False, True, True])
+    still, trails = torch.zeros(4, 2), torch.zeros(4, TRAIL_FEATURES)
     batch = NavigationBatch(pictures, trails, still, success - 1, pictures, trails, 1 - success)
-    result = policy.relabel(batch, torch.tensor([0.3, 0.0, 0.9]), success < 0.5)
+    result = policy.relabel(batch, torch.tensor([0.3, 0.0, 0.9, 0.4]), success > 0.5, attempted)
     assert result.rewards.tolist() == pytest.approx(rewards)
     assert result.continues.tolist() == pytest.approx(continues)
-    assert batch.rewards.tolist() == [-1, -1, 0], "what was given is left as it is"
+    assert batch.rewards.tolist() == [-1, -1, 0, -1], "what was given is left as it is"
 
 
 # --- Learning from LeRobot's batches -------------------------------------------------------------------------
@@ -345,7 +346,8 @@ def make_episode(draw, *outcomes: str) -> list[Frame]:
 def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, success: bool) -> NavigationBatch:
     """The transition of the drive in frame 0."""
     pictures = torch.cat([policy.to_pictures(episode[frame][0]) for frame in (0, after)])
-    chance = 0.0 if success else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
+    attempted = episode[1][1]["skill.pos"] == Skill.GRASP
+    chance = 0.0 if attempted else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
     observations = policy.observer(pictures, policy.grasping)
     trail = Trail()
     trail.moved(DRIVE["x.vel"], DRIVE["theta.vel"])
