@@ -258,9 +258,14 @@ def from_navigation_steps(actions: Tensor) -> Tensor:
 
 
 def _drives(batch: dict[str, Any], skills: Tensor) -> Tensor:
-    """Which frames are navigation steps whose next picture is in the batch, (batch,) bool."""
+    """Which frames are navigation steps whose outcome is in the batch, (batch,) bool.
+
+    Not there are the picture after an episode's last frame, and what came of a curriculum's many attempts.
+    """
     drives = skills == Skill.NAVIGATE
-    return drives & ~_padded(batch, drives.new_ones(len(drives)))[:, 1]
+    padded = _padded(batch, drives.new_ones(len(drives)))
+    failed = (batch["action"][..., _SKILL].round() == Skill.GRASP) & (batch["next.reward"] < 0.5) & ~padded
+    return drives & ~padded[:, 1] & ~failed[:, 1:].all(dim=1)
 
 
 def _trails(batch: dict[str, Any]) -> Tensor:
