@@ -6,18 +6,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from relmm.features import MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict
+from relmm.features import MAX_THETA_VEL, Skill, action_dict
+from relmm.policies.controller import drive_anywhere
 
 # m, where the object is put down. The authors do it at 0.40 in front of the robot; nearer, fewer end up at a wall.
 _PLACE_XY = (0.33, 0.0)
 _TURN_ROUND_STEPS = 6  # 162 degrees: in front there often is a wall by then, and things at a wall are hard to pick up
 _TURN_AWAY_STEPS = 4  # 108 degrees, so that driving on does not push what was just put down
-
-
-def drive_anywhere(rng: np.random.Generator) -> dict[str, float]:
-    """A navigation step drawn uniformly from all of them."""
-    x_vel, theta_vel = rng.uniform((0.0, -MAX_THETA_VEL), (MAX_X_VEL, MAX_THETA_VEL))
-    return action_dict(x_vel=float(x_vel), theta_vel=float(theta_vel))
 
 
 def pseudo_reset(rng: np.random.Generator, steps: int, holding: Callable[[], bool]) -> Iterator[dict[str, float]]:

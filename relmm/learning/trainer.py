@@ -12,8 +12,8 @@ from relmm.learning.curriculum import AutonomousCurriculum, Practice
 from relmm.learning.learner import Learner
 from relmm.learning.life import Life
 from relmm.learning.progress import Progress
-from relmm.learning.pseudo_reset import drive_anywhere, pseudo_reset
-from relmm.policies.controller import grasp_cell
+from relmm.learning.pseudo_reset import pseudo_reset
+from relmm.policies.controller import drive_anywhere, grasp_cell
 from relmm.policies.relmm.grasping import Estimate
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 
