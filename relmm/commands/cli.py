@@ -12,6 +12,7 @@ import sys
 import types
 import warnings
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any, NoReturn
 
 import draccus
@@ -22,17 +23,24 @@ from relmm.errors import ConfigError, RelmmError
 _USAGE_ERROR = 2
 
 
-def run[Config](command: str, config_class: type[Config], job: Callable[[Config], None]) -> None:
+def run[Config](
+    command: str,
+    config_class: type[Config],
+    job: Callable[[Config], None],
+    prepare: Callable[[list[str]], None] = lambda arguments: None,
+) -> None:
     """Parse the command line into a config, do the job, and end with a sentence instead of a traceback.
 
     Args:
         command: its name, for messages.
         config_class: a draccus dataclass; `--policy.path` is understood as in LeRobot.
         job: what to do.
+        prepare: may change the arguments before they are parsed.
     """
     _quiet()
     try:
         _register_plugins()
+        prepare(sys.argv)
         job(_parse(config_class))
     except (RelmmError, OSError) as error:
         print(f"{command}: {_sentence(error)}", file=sys.stderr)
@@ -92,6 +100,11 @@ def _own_error(error: BaseException | None) -> RelmmError | None:
 
 def _sentence(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def now() -> str:
+    """When a run began, to tell it from others with the same settings."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def progress(total: int, unit: str, title: str | None = None, leave: bool = True) -> tqdm[NoReturn]:

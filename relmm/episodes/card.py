@@ -61,7 +61,7 @@ def dataset_card(folder: DatasetFolder, repo_id: str, license: str, contact_shee
 
 
 def _head(repo_id: str, info: dict[str, Any], contact_sheet: bool) -> str:
-    sheet = f"\n\n![Pictures of the dataset: kind of frame, episode:frame]({CONTACT_SHEET})" if contact_sheet else ""
+    sheet = f"\n\n![Pictures of the dataset]({CONTACT_SHEET})\n*What the robot does next, episode:frame.*"
     return f"""# {repo_id}
 
 <a class="flex" href="https://huggingface.co/spaces/lerobot/visualize_dataset?path={repo_id}">
@@ -72,7 +72,7 @@ def _head(repo_id: str, info: dict[str, Any], contact_sheet: bool) -> str:
 The life of a LoCoBot ({info.get("robot_type")}) that picks things up in a room, recorded with `relmm`, a
 [LeRobot]({_LEROBOT}) package of ReLMM, as a LeRobot {info.get("codebase_version")} dataset.
 An episode goes from the pseudo-reset after one success to the next success, or to a step limit. A frame is one blocking
-skill: what the robot saw before it, what it then did, and how that ended.{sheet}"""
+skill: what the robot saw before it, what it then did, and how that ended.{sheet if contact_sheet else ""}"""
 
 
 def _counts(summary: DatasetSummary) -> str:
@@ -84,7 +84,7 @@ def _counts(summary: DatasetSummary) -> str:
         "grasp attempts": str(summary.grasps),
         "of them successful": f"{summary.successful_grasps} ({rate})",
     }
-    return _table(("what", "how many"), rows.items())
+    return table(("what", "how many"), rows.items())
 
 
 def _who(summary: DatasetSummary) -> str:
@@ -92,7 +92,7 @@ def _who(summary: DatasetSummary) -> str:
         (f"`{int(phase)}` {phase.name.lower().replace('_', ' ')}", _PHASES[phase], str(frames))
         for phase, frames in summary.frames_by_phase.items()
     ]
-    return "By `complementary_info.phase`:\n\n" + _table(("phase", "who, and why", "frames"), rows)
+    return "By `complementary_info.phase`:\n\n" + table(("phase", "who, and why", "frames"), rows)
 
 
 def _columns(features: dict[str, Any]) -> str:
@@ -101,7 +101,7 @@ def _columns(features: dict[str, Any]) -> str:
         for key, feature in features.items()
     ]
     names = f"`{'`, `'.join(ACTION_NAMES[:2])}` reach {MAX_X_VEL} m/s and {MAX_THETA_VEL} deg/s. Joints in degrees: "
-    return _table(("column", "type", "meaning and unit"), rows) + f"\n\n{names}`{'`, `'.join(JOINT_NAMES)}`."
+    return table(("column", "type", "meaning and unit"), rows) + f"\n\n{names}`{'`, `'.join(JOINT_NAMES)}`."
 
 
 def _runs(runs: list[dict[str, Any]]) -> str:
@@ -109,7 +109,7 @@ def _runs(runs: list[dict[str, Any]]) -> str:
         return "By LeRobot's own recorder; nothing more is known."
     keys = list(dict.fromkeys(key for run in runs for key in run))
     rows = [tuple("" if run.get(key) is None else str(run[key]) for key in keys) for run in runs]
-    return _table(tuple(key.replace("_", " ") for key in keys), rows)
+    return table(tuple(key.replace("_", " ") for key in keys), rows)
 
 
 def _use(repo_id: str) -> str:
@@ -122,6 +122,7 @@ dataset = LeRobotDataset("{repo_id}")
 Train on it with `relmm` installed: `relmm-train --robot.type=locobot_sim --dataset.init={repo_id}`."""
 
 
-def _table(head: tuple[str, ...], rows: Any) -> str:
+def table(head: tuple[str, ...], rows: Any) -> str:
+    """A table in Markdown."""
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

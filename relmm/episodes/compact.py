@@ -130,7 +130,7 @@ def _by_file(found: Survey, data_path: str) -> dict[str, list[dict[str, Any]]]:
 def _copy_episodes(folder: DatasetFolder, found: Survey, places: dict[int, tuple[int, int]], target: Path) -> None:
     names = [name for name in found.kept_rows if name.startswith("meta/")]
     tables = [pq.read_table(folder.root / name, partitioning=None).slice(0, found.kept_rows[name]) for name in names]
-    table = pa.concat_tables([table.replace_schema_metadata() for table in tables], promote_options="permissive")
+    table = _concat(tables)
     numbers = table["episode_index"].to_pylist()
     columns = {
         "data/chunk_index": [places[number][0] for number in numbers],
@@ -141,4 +141,14 @@ def _copy_episodes(folder: DatasetFolder, found: Survey, places: dict[int, tuple
     for key, values in columns.items():
         table = table.set_column(table.schema.get_field_index(key), key, pa.array(values, pa.int64()))
     (target / _EPISODES).parent.mkdir(parents=True)
-    pq.write_table(table.replace_schema_metadata(tables[0].schema.metadata), target / _EPISODES)
+    pq.write_table(table, target / _EPISODES)
+
+
+def _concat(tables: list[pa.Table]) -> pa.Table:
+    """LeRobot writes a minimum of truth values as a number in one session, and as a truth value in another."""
+    fields = []
+    for field in tables[0].schema:
+        types = {table.schema.field(field.name).type for table in tables}
+        fields.append(field if len(types) == 1 else pa.field(field.name, pa.list_(pa.float64())))
+    schema = pa.schema(fields, tables[0].schema.metadata)
+    return pa.concat_tables([table.select(schema.names).cast(schema) for table in tables])

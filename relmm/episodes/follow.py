@@ -23,7 +23,6 @@ from relmm.episodes.survey import PLACE_COLUMNS, read_columns
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
 
-
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 

@@ -29,6 +29,9 @@ _PRECONDITION_FAILED = 412
 _SPARE_BYTES = 100 << 20  # of the disk, beyond what is downloaded
 
 
+_TIMEOUT_S = 100.0  # without a byte from the Hub
+
+
 class OtherContentError(HubError):
     """The repository holds something that an upload would replace."""
 
@@ -217,3 +220,46 @@ def move_tag(repo_id: str, repo_type: str, tag: str, revision: str) -> None:
     except Exception as error:  # as above
         why = reason(f"{repo_type} {repo_id}", tag, error)
         raise HubError(f"the files are on the Hub, but without the tag {tag}: {why}.") from error
+
+
+def reserve(repo_id: str, repo_type: str, private: bool | None, free_of: str | None) -> str:
+    """See before a long run that a repository can be written to; it is created if need be.
+
+    Args:
+        repo_id: `user/name`.
+        repo_type: `model` or `dataset`.
+        private: whether a new repository is; None for the owner's default.
+        free_of: a file that it must not have, because it would be another run's; None where it may.
+
+    Returns:
+        Why that could not be found out now, as a sentence; empty when all is well.
+
+    Raises:
+        HubError: uploads would be refused.
+    """
+    api, repo = HfApi(), f"{repo_type} {repo_id}"
+    try:
+        api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True)
+        taken = free_of is not None and api.file_exists(repo_id, free_of, repo_type=repo_type)
+    except Exception as error:  # as above
+        why = f"{reason(repo, 'main', error)}."
+        if isinstance(error, HfHubHTTPError) and error.response.status_code in (401, 403, 404):
+            raise HubError(f"nothing could be uploaded: {why}") from error
+        return f"uploads may fail for now: {why}"
+    if taken:
+        raise OtherContentError(f"the {repo} on the Hub is another run's already; choose another name for this one.")
+    return ""
+
+
+def limit_waiting() -> None:
+    """Let transfers of this process fail when the Hub is silent; huggingface_hub would wait forever."""
+    import httpx
+    from huggingface_hub import set_client_factory
+    from huggingface_hub.utils._http import default_client_factory
+
+    def factory() -> httpx.Client:
+        client = default_client_factory()
+        client.timeout = httpx.Timeout(_TIMEOUT_S)
+        return client
+
+    set_client_factory(factory)

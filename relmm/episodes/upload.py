@@ -82,12 +82,8 @@ def _refuse_others(folder: DatasetFolder, repo_id: str, episodes: int) -> Callab
         info, relmm = read(INFO), read(RELMM)
         if info is None:
             return
-        theirs = runs_of(relmm)
-        there = info.get("total_episodes") if isinstance(info, dict) else None
-        if theirs != own[: len(theirs)] or bool(theirs) != bool(own):
-            raise OtherContentError(
-                f"the dataset {repo_id} on the Hub was recorded by another run; choose another name for this one."
-            )
+        theirs, there = runs_of(relmm), info.get("total_episodes") if isinstance(info, dict) else None
+        refuse_other_runs(f"dataset {repo_id}", own, theirs)
         if not isinstance(there, int) or there > episodes:
             raise OtherContentError(
                 f"the dataset {repo_id} on the Hub has {there} episodes and this one {episodes}, so somebody else goes "
@@ -95,6 +91,26 @@ def _refuse_others(folder: DatasetFolder, repo_id: str, episodes: int) -> Callab
             )
 
     return check
+
+
+def refuse_other_runs(repo: str, own: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> None:
+    """Refuse to replace what comes from other runs, or from these and later ones.
+
+    Args:
+        repo: what and which, for the message.
+        own: runs of what is to be uploaded; see `recorded_runs`.
+        theirs: runs of what is on the Hub.
+
+    Raises:
+        OtherContentError: own does not go on from theirs.
+    """
+    if theirs == own[: len(theirs)] and bool(theirs) == bool(own):
+        return
+    if own and own == theirs[: len(own)]:
+        what = "goes on from this one, so somebody else works with it"
+    else:
+        what = "comes from another run"
+    raise OtherContentError(f"the {repo} on the Hub {what}; choose another name for this one.")
 
 
 def recorded_runs(folder: DatasetFolder) -> list[dict[str, Any]]:

@@ -405,7 +405,7 @@ def test_numbers_that_nothing_can_learn_from(tmp_path):
         return pa.array([*rows[:-1], float("nan")], old.type)
 
     rewrite(tmp_path / "d" / DATA.format(0), with_column("next.reward", damaged))
-    with pytest.raises(DatasetError, match="episode 0 in .* numbers that are missing or not finite"):
+    with pytest.raises(DatasetError, match=r"episode 0 in .* numbers that are missing or not finite"):
         list(read_episodes(tmp_path / "d"))
 
 

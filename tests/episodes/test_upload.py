@@ -137,13 +137,13 @@ def test_another_dataset_is_not_replaced(tmp_path, hub):
     upload_dataset(tmp_path / "d", NAME)
     with DurableDataset.create(REPO_ID, tmp_path / "other", False, "locobot_sim", INFO | {"seed": 4}) as dataset:
         record(dataset, range(3))
-    with pytest.raises(HubError, match="another run; choose another name"):
+    with pytest.raises(HubError, match="comes from another run; choose another name"):
         upload_dataset(tmp_path / "other", NAME)
     new_dataset(tmp_path / "shorter", 1)
     with pytest.raises(HubError, match="has 2 episodes and this one 1"):
         upload_dataset(tmp_path / "shorter", NAME)
     hub.create("me/foreign", "datasets", {"meta/info.json": b'{"total_episodes": 1}'})
-    with pytest.raises(HubError, match="another run; choose another name"):
+    with pytest.raises(HubError, match="comes from another run; choose another name"):
         upload_dataset(tmp_path / "d", "me/foreign")
     assert summarize(local_root(NAME)).episodes == 2
 
