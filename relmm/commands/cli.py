@@ -76,9 +76,9 @@ def _parse[Config](config_class: type[Config]) -> Config:
             raise
         # The parser has printed its usage and an error; draccus hides our own checks' words among the causes.
         last_line = messages.getvalue().strip().split("\n")[-1].split("error: ", 1)[-1]
-        raise _own_error(stop) or ConfigError(f"{last_line} (--help shows what there is).") from stop
+        raise own_error(stop) or ConfigError(f"{last_line} (--help shows what there is).") from stop
     except (draccus.utils.DraccusException, argparse.ArgumentError) as error:
-        raise _own_error(error) or ConfigError(_sentence(error)) from error
+        raise own_error(error) or ConfigError(_sentence(error)) from error
 
 
 def _quiet() -> None:
@@ -91,7 +91,7 @@ def _quiet() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads cost more than they give on few cores
 
 
-def _own_error(error: BaseException | None) -> RelmmError | None:
+def own_error(error: BaseException | None) -> RelmmError | None:
     """Ours among the causes of an error: draccus wraps what a config's checks raise."""
     while error is not None and not isinstance(error, RelmmError):
         error = error.__cause__ or error.__context__

@@ -9,6 +9,7 @@ import draccus
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 
+from relmm.commands.cli import own_error
 from relmm.errors import ConfigError
 from relmm.features import dataset_features
 from relmm.learning.actor import Actor
@@ -30,7 +31,7 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
         try:
             policy = PreTrainedConfig.from_pretrained(folder, cli_overrides=overrides)
         except (OSError, ValueError, draccus.utils.DraccusException) as error:
-            raise ConfigError(
+            raise own_error(error) or ConfigError(
                 f"No policy can be loaded from {path!r} ({' '.join(str(error).split())}): use another checkpoint, or "
                 "the version of relmm that wrote it."
             ) from error
