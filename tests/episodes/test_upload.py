@@ -2,6 +2,8 @@
 
 import json
 import re
+import resource
+import signal
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -37,9 +39,10 @@ def test_a_compact_copy_holds_the_same_frames(tmp_path):
     assert pq.ParquetFile(tmp_path / "copy/data/chunk-000/file-000.parquet").num_row_groups == 7
     ours, theirs = (json.loads((tmp_path / d / "meta/info.json").read_text()) for d in ("d", "copy"))
     assert ours == theirs
+    copied = load(tmp_path / "copy").meta.stats
     for key, statistics in load(tmp_path / "d").meta.stats.items():
         for name, values in statistics.items():
-            np.testing.assert_allclose(load(tmp_path / "copy").meta.stats[key][name], values, rtol=1e-6, atol=1e-9)
+            np.testing.assert_allclose(copied[key][name], values, rtol=1e-6, atol=1e-9)
 
 
 def test_large_datasets_have_several_files(tmp_path):
@@ -159,6 +162,64 @@ def test_two_writers_at_the_same_moment(tmp_path, hub):
     hub.hooks.clear()
     assert upload_dataset(tmp_path / "d", NAME).episodes == 2
     assert hub.repo(NAME, "datasets").files["note.md"] == b"someone was faster"
+
+
+UPLOAD_FAULTS = {
+    "500": ({"status": 500}, "HfHubHTTPError.*; try again"),
+    "429": ({"status": 429}, r"too many requests \(429\); try again in some minutes"),
+    "401": ({"status": 401}, "`hf auth login` with a token that may"),
+    "403": ({"status": 403}, "`hf auth login` with a token that may"),
+    "404": ({"status": 404, "headers": {"X-Error-Code": "RepoNotFound"}}, "no dataset me/room.*check the name"),
+    "cut": ({"cut": True}, "try again"),
+}
+STEPS = ("POST /api/repos/create", "GET /api/datasets/me/room", "POST .*/preupload/", "POST .*/commit/", "/tag/")
+
+
+@pytest.mark.parametrize(("settings", "words"), UPLOAD_FAULTS.values(), ids=UPLOAD_FAULTS)
+def test_uploads_that_fail(tmp_path, hub, fault, settings, words):
+    new_dataset(tmp_path / "d", 2)
+    before = snapshot(tmp_path / "d")
+    for step in STEPS if "status" not in settings or settings["status"] == 500 else STEPS[-2:]:
+        hub.clear()
+        hub.faults.append(fault(step, **settings))
+        with pytest.raises(HubError, match=words) as caught:
+            upload_dataset(tmp_path / "d", NAME)
+        assert "\n" not in str(caught.value)
+        assert hub.faults[0].hits, step
+        assert snapshot(tmp_path / "d") == before
+        hub.faults.clear()
+        uploaded = upload_dataset(tmp_path / "d", NAME)
+        assert hub.repo(NAME, "datasets").tags == {"v3.0": uploaded.revision}, "a later upload completes"
+        assert summarize(local_root(f"{NAME}@{uploaded.revision}")).episodes == 2
+
+
+def test_a_slow_hub_only_takes_longer(tmp_path, hub, fault):
+    new_dataset(tmp_path / "d", 1)
+    hub.faults.append(fault("", delay_s=0.1))
+    assert upload_dataset(tmp_path / "d", NAME).episodes == 1
+
+
+def test_a_hub_that_fails_now_and_then(tmp_path, hub, fault):
+    new_dataset(tmp_path / "d", 1)
+    hub.faults += [fault("preupload", status=503, times=2), fault("preupload", cut=True, times=1)]
+    assert upload_dataset(tmp_path / "d", NAME).episodes == 1
+    assert [each.hits for each in hub.faults] == [2, 1]
+
+
+def test_no_room_for_the_copy(tmp_path, hub):
+    new_dataset(tmp_path / "d", 2)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond it then fails with EFBIG
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, hard))
+    try:
+        with pytest.raises(DatasetError, match=r"the copy of .* cannot be written to .*; make room there") as caught:
+            upload_dataset(tmp_path / "d", NAME)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, previous)
+    assert "\n" not in str(caught.value)
+    assert not hub.requests
+    assert upload_dataset(tmp_path / "d", NAME).episodes == 2
 
 
 def test_the_card_says_what_is_in_it(tmp_path, hub):
