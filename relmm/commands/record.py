@@ -12,6 +12,7 @@ from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.policies import FreshWeights, make_actor, policy_from_path, take_seed
+from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
 from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, summarize
@@ -95,8 +96,6 @@ class RecordConfig:
 
 def record(config: RecordConfig) -> None:
     """Record `num_episodes` episodes, and say what the dataset then holds."""
-    from lerobot.robots.utils import make_robot_from_config
-
     root = config.dataset.folder()
     if not config.resume:
         check_new(root, config.dataset.repo_id)
@@ -104,13 +103,10 @@ def record(config: RecordConfig) -> None:
         check_dataset_upload(config.dataset.repo_id, config.dataset.private, config.resume)
     # A resumed recording goes on with other random numbers than it began with.
     seed = config.seed + (summarize(root).episodes if config.resume and root.exists() else 0)
-    take_seed(config.robot, seed)
     take_seed(config.policy, seed)
     assert config.policy is not None
     actor = make_actor(config.policy)
-    robot = make_robot_from_config(config.robot)
-    if not isinstance(robot, LocobotRobot):
-        raise ConfigError(f"relmm-record needs a LoCoBot, not {config.robot.type!r}: say --robot.type=locobot_sim.")
+    robot = make_locobot(config.robot, seed, "relmm-record")
     with StopOnSignal() as signals, robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         with _recorder(config, root, robot) as recorder:

@@ -10,13 +10,13 @@ from typing import Any
 
 import draccus
 import numpy as np
-from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.curve import draw_learning_curve
 from relmm.commands.hub_resume import take_over_from_hub
-from relmm.commands.policies import make_actor, take_seed
+from relmm.commands.policies import make_actor
 from relmm.commands.presets import resolve_config_path
+from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_uploads, run_arguments
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
@@ -29,7 +29,6 @@ from relmm.episodes import (
     read_episodes,
     summarize,
 )
-from relmm.errors import ConfigError
 from relmm.learning.checkpoint import (
     check_same_networks,
     last_checkpoint,
@@ -179,7 +178,7 @@ def _train_on_robot(run: Run) -> None:
         check_new(config.dataset_root, config.dataset.repo_id)
     run.load_data()
     seed = config.seed + (_recorded(config.dataset_root) if config.resume else 0)
-    robot = _make_robot(replace(config.robot), seed)
+    robot = make_locobot(replace(config.robot), seed, "relmm-train")
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         with _recorder(run, robot, seed) as recorder:
@@ -217,16 +216,6 @@ def _train_on_robot(run: Run) -> None:
 def _recorded(root: Path) -> int:
     """Episodes of a dataset, 0 if none has been saved yet."""
     return summarize(root).episodes if any(root.glob("data/*/*.parquet")) else 0
-
-
-def _make_robot(config: RobotConfig, seed: int) -> LocobotRobot:
-    from lerobot.robots.utils import make_robot_from_config
-
-    take_seed(config, seed)
-    robot = make_robot_from_config(config)
-    if not isinstance(robot, LocobotRobot):
-        raise ConfigError(f"relmm-train needs a LoCoBot, not {config.type!r}: say --robot.type=locobot_sim.")
-    return robot
 
 
 def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:

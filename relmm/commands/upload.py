@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from dataclasses import dataclass, field
@@ -92,8 +91,8 @@ class UploadConfig:
         if self.dataset.root is not None:
             return self.dataset.root
         assert self.output_dir is not None
-        settings = _settings(self.output_dir) if (self.output_dir / "checkpoints").is_dir() else {}
-        root = (settings.get("dataset") or {}).get("root")
+        settings = _settings(last_checkpoint(self.output_dir / "checkpoints"))["dataset"]
+        root = settings["root"] or settings["follow"]
         return Path(root) if root else self.output_dir / "dataset"
 
 
@@ -125,7 +124,7 @@ def _upload_policy(config: UploadConfig, checkpoint: Path, dataset: UploadedData
     metrics = config.output_dir / METRICS
     facts = ModelFacts(
         repo_id=config.policy.repo_id,
-        settings=read_json(pretrained_model(checkpoint) / "train_config.json"),
+        settings=_settings(checkpoint),
         metrics=metrics,
         dataset=dataset,
         license=config.policy.license or LICENSE,
@@ -148,9 +147,8 @@ def _upload_policy(config: UploadConfig, checkpoint: Path, dataset: UploadedData
     )
 
 
-def _settings(output_dir: Path) -> dict[str, Any]:
-    path = pretrained_model(last_checkpoint(output_dir / "checkpoints")) / "train_config.json"
-    settings: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+def _settings(checkpoint: Path) -> dict[str, Any]:
+    settings: dict[str, Any] = read_json(pretrained_model(checkpoint) / "train_config.json")
     return settings
 
 

@@ -19,7 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from relmm.episodes.folder import EPISODE_FILES, INFO, DatasetFolder
 from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
-from relmm.episodes.survey import PLACE_COLUMNS, read_columns
+from relmm.episodes.survey import read_columns, read_places
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
 
@@ -159,7 +159,7 @@ class EpisodeFollower:
         return self._last_episodes.get(name, self.next)
 
     def _rows(self, name: str) -> list[dict[str, Any]] | None:
-        table = read_columns(self._folder.root / name, PLACE_COLUMNS)
+        table = read_places(self._folder.root / name)
         if table is None:
             return None
         rows: list[dict[str, Any]] = table.to_pylist()
@@ -183,13 +183,14 @@ class _DataFiles:
         if name != self._name:
             self._name = name
             self._table = read_columns(self._folder.root / name, ["episode_index", "index", *TRAINING_COLUMNS])
-        if self._table is None:
+        length = row["dataset_to_index"] - row["dataset_from_index"]
+        if self._table is None or not 0 < length <= len(self._table):
             return None
         expected = np.arange(row["dataset_from_index"], row["dataset_to_index"])
         begin = int(np.searchsorted(self._table["index"].to_numpy(), row["dataset_from_index"]))
         frames = self._table.slice(begin, len(expected))
         whole = (
-            len(expected) == row["length"] > 0
+            length == row["length"]
             and np.array_equal(frames["index"].to_numpy(), expected)
             and np.all(frames["episode_index"].to_numpy() == row["episode_index"])
         )

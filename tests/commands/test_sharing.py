@@ -173,12 +173,12 @@ def test_going_on_on_another_machine(hub, run, tmp_path):
     assert "policy, step 8: http://127.0.0.1" in trained.stdout
     evaluation = ("--env.type=relmm_room", "--policy.device=cpu", "--env.navigation_steps=20", "--eval.n_episodes=2")
     relmm("evaluate", *evaluation, "--policy.path=first/checkpoints/last/pretrained_model", "--output_dir=eval_here")
-    relmm("evaluate", *evaluation, "--policy.path=me/policy", "--output_dir=eval_there", home="there")
+    relmm("evaluate", *evaluation, "--policy.path=me/policy", "--output_dir=eval_there", home="hf_there")
     here, there = (json.loads((tmp_path / f"eval_{place}/eval_info.json").read_text()) for place in ("here", "there"))
     assert here == there
 
     resume = ("--resume=true", "--steps=14", "--policy.device=cpu")
-    relmm("train", *resume, "--policy.path=me/policy", "--output_dir=there", home="there")
+    relmm("train", *resume, "--policy.path=me/policy", "--output_dir=there", home="hf_there")
     no_push = ("--policy.push_to_hub=false", "--dataset.push_to_hub=false", "--hub.every=0")
     relmm("train", *resume, *no_push, "--output_dir=first")
     for name in ("pretrained_model/model.safetensors", "training_state/navigation/optimizer_state.safetensors"):
@@ -215,7 +215,7 @@ print(len(loaded), loaded.num_episodes)
 def test_lerobot_loads_and_streams_it_on_another_machine(hub, call, run, tmp_path):
     status, _, errors = call(upload.main, "--dataset.repo_id=me/room", f"--dataset.root={SAMPLE}")
     assert status == 0, errors
-    result = run("python", "-c", STREAM, **ONLINE, HF_HOME=str(tmp_path / "there"))
+    result = run("python", "-c", STREAM, **ONLINE, HF_HOME=str(tmp_path / "hf_there"))
     assert result.returncode == 0, result.stderr
     summary = summarize(SAMPLE)
     assert result.stdout.split() == [str(summary.frames), str(summary.episodes)]

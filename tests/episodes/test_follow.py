@@ -415,3 +415,14 @@ def test_a_data_path_that_leads_elsewhere(tmp_path):
     (tmp_path / "d/meta/info.json").write_text(json.dumps(info | {"data_path": "../secret/{file_index}.parquet"}))
     with pytest.raises(DatasetError, match=r"data_path: have \.\./secret/"):
         read_episodes(tmp_path / "d")
+
+
+@pytest.mark.parametrize("damage", [("dataset_to_index", 10**17), ("length", None), ("data/file_index", "../../etc")])
+def test_places_that_cannot_be(tmp_path, damage):
+    new_dataset(tmp_path / "d", 1)
+    path = tmp_path / "d/meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path, partitioning=None)
+    column, value = damage
+    pq.write_table(table.set_column(table.schema.get_field_index(column), column, pa.array([value])), path)
+    with pytest.raises(DatasetError, match="missing or cut off"):
+        list(read_episodes(tmp_path / "d"))
