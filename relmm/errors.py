@@ -13,6 +13,10 @@ class DatasetError(RelmmError):
     """A dataset that cannot be written, read, resumed or repaired."""
 
 
+class HubError(RelmmError):
+    """The Hub cannot be reached, refuses what was asked, or holds something else."""
+
+
 class RobotError(RelmmError):
     """The robot cannot do what was asked."""
 

@@ -116,6 +116,27 @@ def outcome_features() -> dict[str, dict[str, Any]]:
     }
 
 
+# What the columns of a recorded frame mean, with their units.
+DATASET_COLUMNS = {
+    "action": "what was really done: `x.vel` m/s forward, `theta.vel` deg/s (positive = left), both during the drive "
+    "pulse of a navigation step; `skill.pos` 0 navigate, 1 grasp, 2 place; `skill_x.pos`, `skill_y.pos` m in the "
+    "robot's frame (x forward, y left): where to grasp or place",
+    STATE_KEY: "`x.vel` m/s and `theta.vel` deg/s of the last navigation step, from the wheel encoders; arm joints in "
+    "degrees; `gripper.pos` m between the finger pads; `holding.pos` 0 or 1; `bumper.pos` the sum of 1 right, "
+    "2 centre, 4 left",
+    IMAGE_KEY: "the robot's camera before the skill, RGB, PNG, lossless",
+    DEPTH_KEY: "millimetres along the optical axis",
+    "next.reward": "1.0 where this frame's grasp picked something up, as the robot's own sensors judge it",
+    "next.done": "the episode ended with that success",
+    "next.truncated": "the episode ended at its step limit, or because the recording was stopped",
+    "next.success": "as `next.done`",
+    "complementary_info.phase": "who acted, see above",
+    "complementary_info.grasp_probability": "P[grasp] where the policy estimates it, else -1",
+    "complementary_info.robot_time": "s on the robot's clock when the frame began",
+    "timestamp": f"s, the frame's number in its episode divided by {FPS}",
+}
+
+
 def dataset_features(depth: bool = False) -> dict[str, dict[str, Any]]:
     """The whole schema of a relmm dataset, as `LeRobotDataset.create(features=...)` takes it.
 

@@ -12,6 +12,7 @@ import sys
 import types
 import warnings
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any, NoReturn
 
 import draccus
@@ -22,17 +23,24 @@ from relmm.errors import ConfigError, RelmmError
 _USAGE_ERROR = 2
 
 
-def run[Config](command: str, config_class: type[Config], job: Callable[[Config], None]) -> None:
+def run[Config](
+    command: str,
+    config_class: type[Config],
+    job: Callable[[Config], None],
+    prepare: Callable[[list[str]], None] = lambda arguments: None,
+) -> None:
     """Parse the command line into a config, do the job, and end with a sentence instead of a traceback.
 
     Args:
         command: its name, for messages.
         config_class: a draccus dataclass; `--policy.path` is understood as in LeRobot.
         job: what to do.
+        prepare: may change the arguments before they are parsed.
     """
     _quiet()
     try:
         _register_plugins()
+        prepare(sys.argv)
         job(_parse(config_class))
     except (RelmmError, OSError) as error:
         print(f"{command}: {_sentence(error)}", file=sys.stderr)
@@ -68,9 +76,9 @@ def _parse[Config](config_class: type[Config]) -> Config:
             raise
         # The parser has printed its usage and an error; draccus hides our own checks' words among the causes.
         last_line = messages.getvalue().strip().split("\n")[-1].split("error: ", 1)[-1]
-        raise _own_error(stop) or ConfigError(f"{last_line} (--help shows what there is).") from stop
+        raise own_error(stop) or ConfigError(f"{last_line} (--help shows what there is).") from stop
     except (draccus.utils.DraccusException, argparse.ArgumentError) as error:
-        raise _own_error(error) or ConfigError(_sentence(error)) from error
+        raise own_error(error) or ConfigError(_sentence(error)) from error
 
 
 def _quiet() -> None:
@@ -83,7 +91,7 @@ def _quiet() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads cost more than they give on few cores
 
 
-def _own_error(error: BaseException | None) -> RelmmError | None:
+def own_error(error: BaseException | None) -> RelmmError | None:
     """Ours among the causes of an error: draccus wraps what a config's checks raise."""
     while error is not None and not isinstance(error, RelmmError):
         error = error.__cause__ or error.__context__
@@ -92,6 +100,11 @@ def _own_error(error: BaseException | None) -> RelmmError | None:
 
 def _sentence(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def now() -> str:
+    """When a run began, to tell it from others with the same settings."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def progress(total: int, unit: str, title: str | None = None, leave: bool = True) -> tqdm[NoReturn]:

@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import draccus
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 
+from relmm.commands.cli import own_error
 from relmm.errors import ConfigError
 from relmm.features import dataset_features
 from relmm.learning.actor import Actor
+from relmm.learning.hub import fetch_policy
+from relmm.learning.untrusted import check_features, check_policy_folder, check_weights
 
 
 def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
@@ -23,17 +27,27 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
     path = parser.get_path_arg("policy")
     if path:
         overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+        folder = fetch_policy(path)
         try:
-            policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-        except (OSError, ValueError) as error:
-            raise ConfigError(
-                f"No policy can be loaded from {path!r} ({' '.join(str(error).split())}): give the folder of a "
-                "checkpoint's pretrained_model, or a repository user/name on the Hub."
+            policy = PreTrainedConfig.from_pretrained(folder, cli_overrides=overrides)
+        except (OSError, ValueError, draccus.utils.DraccusException) as error:
+            raise own_error(error) or ConfigError(
+                f"No policy can be loaded from {path!r} ({' '.join(str(error).split())}): use another checkpoint, or "
+                "the version of relmm that wrote it."
             ) from error
-        policy.pretrained_path = Path(path)
+        policy.pretrained_path = folder
+        check_features(policy, folder)
+        _forget_owner(policy, overrides)
     if policy is None:
         raise ConfigError("No policy was given: say --policy.type=relmm_scripted, or --policy.path=FOLDER_OR_REPO.")
     return policy
+
+
+def _forget_owner(policy: PreTrainedConfig, overrides: list[str]) -> None:
+    """Where a policy was uploaded to is not where this run uploads to."""
+    for name, value in (("push_to_hub", False), ("repo_id", None), ("private", None)):
+        if not any(override.startswith(f"--{name}") for override in overrides):
+            setattr(policy, name, value)
 
 
 class FreshWeights:
@@ -87,8 +101,13 @@ def make_actor(config: PreTrainedConfig) -> Actor:
     if not config.input_features:
         config.input_features = {key: value for key, value in features.items() if key != "action"}
     config.output_features = {"action": features["action"]}
-    path = config.pretrained_path
-    policy_class = get_policy_class(config.type)
-    policy = policy_class.from_pretrained(path, config=config) if path else policy_class(config=config)
-    pre, post = make_pre_post_processors(config, pretrained_path=str(path) if path else None)
+    path, policy_class = config.pretrained_path, get_policy_class(config.type)
+    if path is None:
+        return Actor(policy_class(config=config), *make_pre_post_processors(config))
+    check_policy_folder(Path(path))
+    check_weights(config, Path(path))
+    policy = policy_class.from_pretrained(path, config=config)
+    # The processors were saved with the device of the machine that trained.
+    device = {"device_processor": {"device": config.device}}
+    pre, post = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=device)
     return Actor(policy, pre, post)

@@ -6,11 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
-from relmm.commands.cli import StopOnSignal, progress, run
+from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.policies import FreshWeights, make_actor, policy_from_path, take_seed
+from relmm.commands.robots import make_locobot
+from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
+from relmm.commands.upload import LICENSE
 from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, summarize
 from relmm.errors import ConfigError
 from relmm.learning.actor import Actor
@@ -29,11 +33,17 @@ class RecordDatasetConfig:
         repo_id: name of the dataset, `user/name`.
         root: its folder; None for LeRobot's own place for datasets of that name.
         num_episodes: how many to record in this run.
+        push_to_hub: upload it to `repo_id` at the end.
+        private: whether a new repository is private; None for the owner's default.
+        license: for its card, an identifier of the Hub.
     """
 
     repo_id: str
     root: Path | None = None
     num_episodes: int = 10
+    push_to_hub: bool = False
+    private: bool | None = None
+    license: str = LICENSE
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
@@ -86,31 +96,32 @@ class RecordConfig:
 
 def record(config: RecordConfig) -> None:
     """Record `num_episodes` episodes, and say what the dataset then holds."""
-    from lerobot.robots.utils import make_robot_from_config
-
     root = config.dataset.folder()
     if not config.resume:
         check_new(root, config.dataset.repo_id)
+    if config.dataset.push_to_hub:
+        check_dataset_upload(config.dataset.repo_id, config.dataset.private, config.resume)
     # A resumed recording goes on with other random numbers than it began with.
     seed = config.seed + (summarize(root).episodes if config.resume and root.exists() else 0)
-    take_seed(config.robot, seed)
     take_seed(config.policy, seed)
     assert config.policy is not None
     actor = make_actor(config.policy)
-    robot = make_robot_from_config(config.robot)
-    if not isinstance(robot, LocobotRobot):
-        raise ConfigError(f"relmm-record needs a LoCoBot, not {config.robot.type!r}: say --robot.type=locobot_sim.")
+    robot = make_locobot(config.robot, seed, "relmm-record")
     with StopOnSignal() as signals, robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         with _recorder(config, root, robot) as recorder:
             _collect(config, robot, actor, recorder, seed, signals)
     print(summarize(root))
+    if config.dataset.push_to_hub:
+        settings = config.dataset
+        Uploads(dataset_arguments(settings.repo_id, root, settings.private, settings.license), root).finish()
 
 
 def _recorder(config: RecordConfig, root: Path, robot: LocobotRobot) -> EpisodeRecorder:
     settings, policy = config.robot, config.policy
     assert policy is not None
     info = {key: getattr(settings, key) for key in ("room", "num_objects", "camera", "seed") if hasattr(settings, key)}
+    info["started"] = now()
     return EpisodeRecorder(
         root,
         config.dataset.repo_id,
@@ -118,7 +129,7 @@ def _recorder(config: RecordConfig, root: Path, robot: LocobotRobot) -> EpisodeR
         save_unfinished=True,
         depth="front_depth" in robot.observation_features,
         robot_type=robot.name,
-        info={**info, "policy": policy.type, "policy_path": str(policy.pretrained_path or "")},
+        info={**info, "policy": policy.type, "policy_path": parser.get_path_arg("policy") or ""},
     )
 
 

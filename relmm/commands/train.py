@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -11,12 +10,14 @@ from typing import Any
 
 import draccus
 import numpy as np
-from lerobot.robots.config import RobotConfig
 
-from relmm.commands.cli import StopOnSignal, progress, run
+from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.curve import draw_learning_curve
-from relmm.commands.policies import make_actor, take_seed
+from relmm.commands.hub_resume import take_over_from_hub
+from relmm.commands.policies import make_actor
 from relmm.commands.presets import resolve_config_path
+from relmm.commands.robots import make_locobot
+from relmm.commands.sharing import Uploads, check_uploads, run_arguments
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
 from relmm.episodes import (
@@ -28,7 +29,6 @@ from relmm.episodes import (
     read_episodes,
     summarize,
 )
-from relmm.errors import ConfigError
 from relmm.learning.checkpoint import (
     check_same_networks,
     last_checkpoint,
@@ -78,6 +78,8 @@ class Run:
         self.learner = Learner(policy, self.replay, config.seed)
         self.rng = np.random.default_rng([config.seed, _TRAINER_STREAM])
         self.progress = Progress()
+        assert config.output_dir is not None
+        self.uploads = Uploads(run_arguments(config), config.output_dir)
 
     def load_data(self) -> None:
         """Fill the replay: with the dataset to start from, then with the run's own, and learn what is new in them."""
@@ -126,7 +128,8 @@ class Run:
         """The loop with everything around it."""
         config = self.config
         assert config.output_dir is not None
-        schedule = Schedule(config.steps, config.log_freq, config.save_freq, config.env_eval_freq)
+        schedule = Schedule(config.steps, config.log_freq, config.save_freq, config.env_eval_freq, config.hub.every)
+        self.uploads.say = bar.write
 
         def show(status: dict[str, Any]) -> None:
             curriculum = status["practice_attempts"] if status["steps"] == 0 else None
@@ -134,9 +137,19 @@ class Run:
             losses = {key: f"{value:.2f}" for key, value in self.learner.logs.items() if key.endswith("_loss")}
             bar.set_postfix({"curriculum": curriculum} if curriculum else shown | losses, refresh=False)
             bar.update(status["steps"] - bar.n)
+            self.uploads.check()
 
         metrics = Metrics(config.output_dir / "metrics.jsonl")
-        return Session(schedule, self.progress, self.learner, metrics, save=save, evaluate=evaluate, show=show)
+        return Session(
+            schedule,
+            self.progress,
+            self.learner,
+            metrics,
+            save=save,
+            evaluate=evaluate,
+            show=show,
+            upload=self.uploads.begin,
+        )
 
 
 def train(config: TrainConfig) -> None:
@@ -144,14 +157,18 @@ def train(config: TrainConfig) -> None:
     import torch
 
     torch.set_num_threads(config.num_threads)
+    check_uploads(config)
     with StopOnSignal() as signals:
+        run = Run(config, signals)
         if config.dataset.follow is not None:
-            _train_on_stream(Run(config, signals), config.dataset.follow)
+            _train_on_stream(run, config.dataset.follow)
         else:
-            _train_on_robot(Run(config, signals))
+            _train_on_robot(run)
     assert config.output_dir is not None
     draw_learning_curve(config.output_dir / "metrics.jsonl", config.output_dir / "learning_curve.png")
     print(f"checkpoints, metrics, dataset and learning_curve.png: {config.output_dir}")
+    run.uploads.say = print
+    run.uploads.finish()
 
 
 def _train_on_robot(run: Run) -> None:
@@ -161,10 +178,10 @@ def _train_on_robot(run: Run) -> None:
         check_new(config.dataset_root, config.dataset.repo_id)
     run.load_data()
     seed = config.seed + (_recorded(config.dataset_root) if config.resume else 0)
-    robot = _make_robot(replace(config.robot), seed)
+    robot = make_locobot(replace(config.robot), seed, "relmm-train")
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
-        with _recorder(run, robot) as recorder:
+        with _recorder(run, robot, seed) as recorder:
             if recorder.repaired:
                 print(recorder.repaired)
             life = Life(
@@ -201,19 +218,9 @@ def _recorded(root: Path) -> int:
     return summarize(root).episodes if any(root.glob("data/*/*.parquet")) else 0
 
 
-def _make_robot(config: RobotConfig, seed: int) -> LocobotRobot:
-    from lerobot.robots.utils import make_robot_from_config
-
-    take_seed(config, seed)
-    robot = make_robot_from_config(config)
-    if not isinstance(robot, LocobotRobot):
-        raise ConfigError(f"relmm-train needs a LoCoBot, not {config.type!r}: say --robot.type=locobot_sim.")
-    return robot
-
-
-def _recorder(run: Run, robot: LocobotRobot) -> EpisodeRecorder:
+def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:
     config, settings = run.config, run.config.robot
-    info = {key: getattr(settings, key) for key in ("room", "num_objects", "camera", "seed") if hasattr(settings, key)}
+    info = {key: getattr(settings, key) for key in ("room", "num_objects", "camera") if hasattr(settings, key)}
     root = config.dataset_root
     root.parent.mkdir(parents=True, exist_ok=True)
     return EpisodeRecorder(
@@ -223,7 +230,7 @@ def _recorder(run: Run, robot: LocobotRobot) -> EpisodeRecorder:
         save_unfinished=True,
         depth="front_depth" in robot.observation_features,
         robot_type=robot.name,
-        info={**info, "policy": "relmm", "curriculum": config.curriculum.type},
+        info={**info, "seed": seed, "started": now(), "policy": "relmm", "curriculum": config.curriculum.type},
     )
 
 
@@ -273,10 +280,14 @@ def _train_on_stream(run: Run, root: Path) -> None:
 
 def main() -> None:
     """Entry point of `relmm-train`; there is only one policy that learns, so its type need not be said."""
-    resolve_config_path(sys.argv)
-    if not any(argument.startswith(("--policy.type", "--policy.path", "--config_path")) for argument in sys.argv):
-        sys.argv.append("--policy.type=relmm")
-    run("relmm-train", TrainConfig, train)
+    run("relmm-train", TrainConfig, train, prepare=_prepare)
+
+
+def _prepare(arguments: list[str]) -> None:
+    take_over_from_hub(arguments)
+    resolve_config_path(arguments)
+    if not any(argument.startswith(("--policy.type", "--policy.path", "--config_path")) for argument in arguments):
+        arguments.append("--policy.type=relmm")
 
 
 if __name__ == "__main__":

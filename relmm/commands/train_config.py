@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
+from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.policies import policy_from_path
+from relmm.commands.upload import LICENSE
 from relmm.episodes import check_repo_id
 from relmm.errors import ConfigError
 from relmm.learning.curriculum import CURRICULA
@@ -25,15 +27,46 @@ class TrainDatasetConfig:
         root: its folder; None for `dataset` in the output folder.
         init: a dataset (folder, or user/name on the Hub) to fill the replay with and train on first.
         follow: a dataset that another process is recording; there is no robot then.
+        push_to_hub: upload it to `repo_id` at the end, and every `hub.every` steps.
+        private: whether a new repository is private; None for the owner's default.
+        license: for its card, an identifier of the Hub.
     """
 
     repo_id: str = "local/relmm"
     root: Path | None = None
     init: str | None = None
     follow: Path | None = None
+    push_to_hub: bool = False
+    private: bool | None = None
+    license: str = LICENSE
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
+        if self.push_to_hub and self.repo_id.startswith("local/"):
+            raise ConfigError(
+                f"dataset.repo_id is {self.repo_id!r}, which is on this machine only: also say "
+                "--dataset.repo_id=user/name to upload the dataset."
+            )
+        if self.push_to_hub and self.follow is not None:
+            raise ConfigError(
+                "--dataset.push_to_hub=true is for the process that records: say it there, not with --dataset.follow."
+            )
+
+
+@dataclass
+class HubConfig:
+    """When to upload to the Hub what `policy.push_to_hub` and `dataset.push_to_hub` ask for.
+
+    Args:
+        every: navigation steps between uploads while training, in the background; each is preceded by a checkpoint,
+            and takes with it the episodes that are saved by then. 0 to upload at the end of the run only.
+    """
+
+    every: int = 0
+
+    def __post_init__(self) -> None:
+        if self.every < 0:
+            raise ConfigError(f"hub.every is {self.every}, but must not be negative; 0 uploads at the end only.")
 
 
 @dataclass
@@ -82,6 +115,7 @@ class TrainConfig:
         policy: `--policy.type=relmm` and its hyper-parameters, or `--policy.path` to go on from.
         curriculum: `--curriculum.type=stationary`, `autonomous` or `none`.
         eval: evaluation while training.
+        hub: when to upload; what, is said with `--policy.push_to_hub`, `--policy.repo_id`, `--dataset.push_to_hub`.
         steps: navigation steps to train for, those of earlier runs included.
         seed: of everything random; equal seeds give equal runs.
         output_dir: a folder that does not exist yet; None for outputs/train/DATE/TIME_JOB.
@@ -101,6 +135,7 @@ class TrainConfig:
     policy: PreTrainedConfig | None = None
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
+    hub: HubConfig = field(default_factory=HubConfig)
     steps: int = 2000
     seed: int = 0
     output_dir: Path | None = None
@@ -134,7 +169,25 @@ class TrainConfig:
             )
         if self.policy.seed is None:
             self.policy.seed = self.seed
+        self._check_uploads()
         self._choose_folder()
+
+    def _check_uploads(self) -> None:
+        policy = self.policy
+        assert policy is not None
+        if policy.push_to_hub and policy.repo_id is None:
+            if parser.parse_arg("policy.push_to_hub") is not None:
+                raise ConfigError(
+                    "Say where to upload the policy: --policy.push_to_hub=true --policy.repo_id=user/name."
+                )
+            policy.push_to_hub = False  # LeRobot's own default, in a config that it has written
+        if policy.push_to_hub:
+            check_repo_id(str(policy.repo_id))
+        if self.hub.every and not (policy.push_to_hub or self.dataset.push_to_hub):
+            raise ConfigError(
+                f"hub.every is {self.hub.every}, but nothing is uploaded: also say --policy.push_to_hub=true "
+                "--policy.repo_id=user/name, or --dataset.push_to_hub=true."
+            )
 
     def _choose_folder(self) -> None:
         if self.output_dir is None:

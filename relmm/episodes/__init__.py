@@ -7,6 +7,7 @@ from relmm.episodes.recorder import EpisodeRecorder
 from relmm.episodes.repair import RepairReport, verify_and_repair
 from relmm.episodes.settings import check_new, check_repo_id, check_resume, check_trainable
 from relmm.episodes.summary import DatasetSummary, summarize
+from relmm.episodes.upload import UploadedDataset, upload_dataset
 from relmm.episodes.writer import DurableDataset
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "EpisodeRecorder",
     "FrameBuilder",
     "RepairReport",
+    "UploadedDataset",
     "check_new",
     "check_repo_id",
     "check_resume",
@@ -24,5 +26,6 @@ __all__ = [
     "local_root",
     "read_episodes",
     "summarize",
+    "upload_dataset",
     "verify_and_repair",
 ]

@@ -19,9 +19,11 @@ from numpy.typing import DTypeLike, NDArray
 
 from relmm.episodes.folder import EPISODE_FILES, INFO, DatasetFolder
 from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
-from relmm.episodes.survey import PLACE_COLUMNS, read_columns
+from relmm.episodes.survey import read_columns, read_places
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +159,7 @@ class EpisodeFollower:
         return self._last_episodes.get(name, self.next)
 
     def _rows(self, name: str) -> list[dict[str, Any]] | None:
-        table = read_columns(self._folder.root / name, PLACE_COLUMNS)
+        table = read_places(self._folder.root / name)
         if table is None:
             return None
         rows: list[dict[str, Any]] = table.to_pylist()
@@ -181,24 +183,31 @@ class _DataFiles:
         if name != self._name:
             self._name = name
             self._table = read_columns(self._folder.root / name, ["episode_index", "index", *TRAINING_COLUMNS])
-        if self._table is None:
+        length = row["dataset_to_index"] - row["dataset_from_index"]
+        if self._table is None or not 0 < length <= len(self._table):
             return None
         expected = np.arange(row["dataset_from_index"], row["dataset_to_index"])
         begin = int(np.searchsorted(self._table["index"].to_numpy(), row["dataset_from_index"]))
         frames = self._table.slice(begin, len(expected))
         whole = (
-            len(expected) == row["length"] > 0
+            length == row["length"]
             and np.array_equal(frames["index"].to_numpy(), expected)
             and np.all(frames["episode_index"].to_numpy() == row["episode_index"])
         )
         return self._episode(row["episode_index"], frames) if whole else None
 
     def _episode(self, index: int, frames: pa.Table) -> Episode:
+        where = self._folder.root / self._name
         try:
             images = _decode(frames[IMAGE_KEY])
         except (ValueError, cv2.error) as error:
-            where = self._folder.root / self._name
             raise DatasetError(f"a picture of episode {index} in {where} cannot be read: {error}.") from error
+        try:
+            return self._checked(index, images, frames)
+        except (ValueError, pa.ArrowException) as error:
+            raise DatasetError(f"episode {index} in {where} cannot be learned from: {error}.") from error
+
+    def _checked(self, index: int, images: NDArray[np.uint8], frames: pa.Table) -> Episode:
         return Episode(
             index=index,
             images=images,
@@ -218,7 +227,10 @@ def _numbers(column: pa.ChunkedArray, dtype: DTypeLike) -> NDArray[Any]:
     values = column.combine_chunks()
     if pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
         values = values.flatten()
-    return values.to_numpy(zero_copy_only=False).astype(dtype)
+    numbers = values.to_numpy(zero_copy_only=False).astype(dtype)
+    if len(numbers) % len(column) or not np.isfinite(numbers).all():
+        raise ValueError("it has numbers that are missing or not finite")
+    return numbers
 
 
 def _decode(column: pa.ChunkedArray) -> NDArray[np.uint8]:
@@ -227,9 +239,15 @@ def _decode(column: pa.ChunkedArray) -> NDArray[np.uint8]:
     for image, file in zip(images, files, strict=True):
         if not file:
             raise ValueError("it is not in the file, which has only its name")
+        # The size is in the first bytes; a small file may claim gigabytes of pixels.
+        if file[:8] != _PNG_SIGNATURE:
+            raise ValueError("it is no PNG")
+        width, height = (int.from_bytes(file[i : i + 4], "big") for i in (16, 20))
+        if (height, width) != image.shape[:2]:
+            raise ValueError(f"it has the shape {(height, width)}, and {image.shape[:2]} is needed")
         picture = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR)
         if picture is None:
-            raise ValueError("it is no PNG")
+            raise ValueError("it is damaged")
         if picture.shape != image.shape:
             raise ValueError(f"it has the shape {picture.shape}, and {image.shape} is needed")
         image[:] = picture[..., ::-1]  # OpenCV's order is BGR

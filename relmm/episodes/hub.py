@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from huggingface_hub.errors import (
-    HfHubHTTPError,
-    LocalEntryNotFoundError,
-    RepositoryNotFoundError,
-    RevisionNotFoundError,
-)
-
-from relmm.episodes.folder import INFO
+from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, RELMM, STATS, TASKS
+from relmm.episodes.remote import download, reason
 from relmm.episodes.settings import FORMAT_VERSION, check_repo_id
-from relmm.errors import ConfigError, DatasetError
+from relmm.errors import ConfigError, DatasetError, HubError
+
+# What a dataset consists of, and the largest sizes that are plausible, in bytes: LeRobot's data files have 100 MB.
+_FILES = {
+    INFO: 10 << 20,
+    STATS: 10 << 20,
+    RELMM: 10 << 20,
+    TASKS: 10 << 20,
+    EPISODE_FILES: 1 << 30,
+    DATA_FILES: 1 << 30,
+}
 
 
 def local_root(path_or_repo: str) -> Path:
@@ -45,33 +49,21 @@ def local_root(path_or_repo: str) -> Path:
     recorded = HF_LEROBOT_HOME / repo_id
     if not revision and (recorded / INFO).is_file():
         return recorded
-    return _download(repo_id, revision or FORMAT_VERSION)
+    return download_dataset(repo_id, revision or FORMAT_VERSION)
 
 
-def _download(repo_id: str, revision: str) -> Path:
-    from huggingface_hub import snapshot_download
+def download_dataset(repo_id: str, revision: str) -> Path:
+    """A dataset of the Hub in LeRobot's cache.
+
+    Raises:
+        DatasetError: the download fails.
+    """
     from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
     try:
-        folder = snapshot_download(repo_id, repo_type="dataset", revision=revision, cache_dir=HF_LEROBOT_HUB_CACHE)
+        return download(repo_id, "dataset", revision, _FILES, HF_LEROBOT_HUB_CACHE)
+    except HubError as error:
+        raise DatasetError(str(error)) from error
     except Exception as error:  # the Hub's client also raises those of its HTTP library, which may change
-        raise DatasetError(f"there is no folder {repo_id!r}, and {_reason(repo_id, revision, error)}.") from error
-    return Path(folder)
-
-
-def _reason(repo_id: str, revision: str, error: Exception) -> str:
-    if isinstance(error, RevisionNotFoundError):
-        return f"the dataset {repo_id} on the Hub has no revision {revision!r}; name another, as in {repo_id}@main"
-    refused = isinstance(error, HfHubHTTPError) and error.response.status_code in (401, 403)
-    if isinstance(error, RepositoryNotFoundError) or refused:
-        return (
-            f"the Hub has no dataset {repo_id} that you may read; check the name, or `hf auth login` "
-            "if it is private or gated"
-        )
-    if isinstance(error, LocalEntryNotFoundError):
-        return (
-            f"the Hub cannot be reached for the dataset {repo_id}, of which no copy is on this machine; "
-            "check the connection and HF_HUB_OFFLINE, or give a folder"
-        )
-    reason = str(error).strip().split("\n")[0].rstrip(".")
-    return f"the download of {repo_id} from the Hub has failed ({type(error).__name__}: {reason}); try again"
+        why = reason(f"dataset {repo_id}", revision, error)
+        raise DatasetError(f"there is no folder {repo_id!r}, and {why}.") from error

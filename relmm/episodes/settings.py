@@ -27,6 +27,7 @@ TRAINING_COLUMNS = (
     "complementary_info.robot_time",
 )
 FORMAT_VERSION = "v3.0"  # LeRobot's, also the tag of datasets on the Hub
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"  # LeRobot's
 
 
 def features_to_store(depth: bool) -> dict[str, dict[str, Any]]:
@@ -121,9 +122,11 @@ def check_trainable(root: Path | str) -> None:
         )
     have, want = info["features"], dataset_features()
     differences = []
-    if info["codebase_version"].split(".")[0] != FORMAT_VERSION.split(".")[0]:
+    if str(info["codebase_version"]).split(".")[0] != FORMAT_VERSION.split(".")[0]:
         differences += _differences("format", info["codebase_version"], FORMAT_VERSION)
     differences += _differences("fps", info["fps"], FPS)
+    # A template is a small program: one from elsewhere could name any file of this machine.
+    differences += _differences("data_path", info.get("data_path"), DATA_PATH)
     for key in TRAINING_COLUMNS:
         differences += _differences(f"column {key}", _describe(have.get(key)), _describe(want[key]))
     if differences:
@@ -170,11 +173,13 @@ def _feature_differences(have: dict[str, Any], want: dict[str, Any]) -> list[str
     return differences
 
 
-def _describe(feature: dict[str, Any] | None) -> str:
+def _describe(feature: Any) -> str:
     if feature is None:
         return "no such column"
+    if not isinstance(feature, dict) or not {"dtype", "shape"} <= feature.keys():
+        return f"no description ({feature!r})"
     names = feature.get("names")
-    return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" of {', '.join(names)}" if names else "")
+    return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" of {', '.join(map(str, names))}" if names else "")
 
 
 def _differences(name: str, have: Any, want: Any) -> list[str]:

@@ -62,6 +62,16 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table | None:
     return table if len(table.column_names) == len(columns) else None
 
 
+def read_places(path: Path) -> pa.Table | None:
+    """`PLACE_COLUMNS` of a file of meta/episodes; None also where they are not whole numbers."""
+    table = read_columns(path, PLACE_COLUMNS)
+    if table is None:
+        return None
+    numbers = [table[name] for name in PLACE_COLUMNS[:-1]]
+    whole = all(pa.types.is_integer(column.type) and column.null_count == 0 for column in numbers)
+    return table if whole else None
+
+
 def survey(folder: DatasetFolder, data_path: str) -> Survey:
     """Find the longest run of whole episodes from the first one on; reads only.
 
@@ -70,7 +80,7 @@ def survey(folder: DatasetFolder, data_path: str) -> Survey:
         data_path: LeRobot's template for data files, from info.json.
     """
     result = Survey()
-    tables = {name: read_columns(folder.root / name, PLACE_COLUMNS) for name in folder.files(EPISODE_FILES)}
+    tables = {name: read_places(folder.root / name) for name in folder.files(EPISODE_FILES)}
     data = _DataFiles(folder, data_path)
     rows = [(name, row) for name, table in tables.items() if table is not None for row in table.to_pylist()]
     for number, (name, row) in enumerate(rows):
@@ -114,7 +124,8 @@ class _DataFiles:
         """The task indices of the next episode of its file; None when that file does not hold it whole."""
         name = self._data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
         columns = self._read(name)
-        if columns is None:
+        # A row that promises more frames than there are is not worth the memory to compare them.
+        if columns is None or row["length"] > columns.shape[1]:
             return None
         begin = self.taken.get(name, 0)
         episode, index, tasks = columns[:, begin : begin + row["length"]]

@@ -15,6 +15,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from relmm.episodes.folder import sync
@@ -94,6 +95,46 @@ def pretrained_model(checkpoint: Path) -> Path:
     return checkpoint / _MODEL
 
 
+def training_state(checkpoint: Path) -> Path:
+    """The folder of a checkpoint that training goes on from."""
+    return checkpoint / _STATE
+
+
+def portable_config(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings without what belongs to one machine or person: folders, and where it is uploaded to.
+
+    Args:
+        config: content of a `train_config.json`, perhaps from elsewhere.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    policy, dataset = config.get("policy"), config.get("dataset")
+    if not isinstance(policy, dict) or not isinstance(dataset, dict):
+        raise ConfigError("train_config.json has no settings of policy and dataset; use another checkpoint.")
+    policy = {**policy, "push_to_hub": False, "repo_id": None, "private": None, "pretrained_path": None}
+    dataset = {**dataset, "push_to_hub": False, "private": None, "root": None}
+    return {**config, "policy": policy, "dataset": dataset, "hub": {}, "output_dir": None, "resume": False}
+
+
+def install_checkpoint(folder: Path, step: int, model: Path, names: list[str]) -> None:
+    """Make `folder/<step>` of a downloaded checkpoint, and point `folder/last` to it.
+
+    Args:
+        folder: the run's `checkpoints`, which does not exist yet.
+        step: navigation steps so far.
+        model: with the policy's files, and `training_state`.
+        names: of the policy's files.
+    """
+    target = folder / f"{step:06d}"
+    (target / _MODEL).mkdir(parents=True)
+    for name in names:
+        shutil.copyfile(model / name, target / _MODEL / name)
+    shutil.copytree(model / _STATE, target / _STATE)
+    _sync_tree(target)
+    _link(folder / _LAST, target.name)
+
+
 def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[str, Any]:
     """Restore what `save_checkpoint` wrote, but for the weights, and give back the counters.
 
@@ -104,17 +145,34 @@ def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[st
 
     try:
         load_optimizer_state(learner.optimizers, checkpoint / _STATE)
+        _check_optimizers(learner)
         state = json.loads((checkpoint / _STATE / _COUNTERS).read_text(encoding="utf-8"))
         generators = load_file(checkpoint / _STATE / _RANDOM)
         learner.policy.rng.set_state(generators["policy"])
         learner.noise.set_state(generators["noise"])
         rng.bit_generator.state = state["random"]["trainer"]
         learner.rng.bit_generator.state = state["random"]["learner"]
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        counters: dict[str, Any] = {key: _count(key, value) for key, value in state["counters"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, SafetensorError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"The training state in {checkpoint} cannot be read ({reason}); resume another.") from error
-    counters: dict[str, Any] = state["counters"]
     return counters
+
+
+def _check_optimizers(learner: Learner) -> None:
+    """Torch takes any state for an optimiser, and fails, or learns nonsense, at its first step."""
+    for name, optimizer in learner.optimizers.items():
+        for group in optimizer.param_groups:
+            for weight in group["params"]:
+                for key, value in optimizer.state[weight].items():
+                    if not value.isfinite().all() or (value.ndim and value.shape != weight.shape):
+                        raise ValueError(f"{key} of the optimiser of {name} does not fit its weight")
+
+
+def _count(name: str, value: Any) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise ValueError(f"{name} is {value!r} and counts something")
+    return value
 
 
 def _write_json(path: Path, data: Any) -> None:

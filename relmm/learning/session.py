@@ -20,12 +20,14 @@ class Schedule:
         steps: the end.
         log_freq, save_freq: between lines of the metrics, and between checkpoints.
         eval_freq: between evaluations; 0 for none.
+        upload_freq: between uploads of a new checkpoint; 0 for none.
     """
 
     steps: int
     log_freq: int
     save_freq: int
     eval_freq: int
+    upload_freq: int = 0
 
 
 class Session:
@@ -39,6 +41,7 @@ class Session:
         save: writes a checkpoint.
         evaluate: the scores of the policy as it is.
         show: tells the user, after every attempt and step.
+        upload: begins to upload the newest checkpoint, without waiting.
     """
 
     def __init__(
@@ -51,9 +54,10 @@ class Session:
         save: Callable[[], None],
         evaluate: Callable[[], dict[str, Any]],
         show: Callable[[dict[str, Any]], None],
+        upload: Callable[[], None] = lambda: None,
     ) -> None:
         self._schedule, self._progress, self._learner, self._metrics = schedule, progress, learner, metrics
-        self._save, self._evaluate, self._show = save, evaluate, show
+        self._save, self._evaluate, self._show, self._upload = save, evaluate, show, upload
         self._started = time.monotonic()
         self._saved_at = -1
 
@@ -94,8 +98,11 @@ class Session:
             self._metrics.write(**self._status(), **self._learner.logs)
         if _passed(before, step, schedule.eval_freq):
             self._metrics.write(**self._status(), **self._evaluate())
-        if save or _passed(before, step, schedule.save_freq):
+        upload = _passed(before, step, schedule.upload_freq)
+        if save or upload or _passed(before, step, schedule.save_freq):
             self._checkpoint()
+        if upload:
+            self._upload()
 
     def _checkpoint(self) -> None:
         if self._saved_at != self._progress.steps:

@@ -49,8 +49,10 @@ class ControllerConfig(PreTrainedConfig):
         seed: of its random choices; each episode draws its own stream from it, however episodes are batched. None for
             that of the command, or 0.
         num_grasp: grasp attempts in a row after a navigation step (N_grasp of the paper).
+        push_to_hub: upload it to `repo_id`; only when asked, where LeRobot's default is to upload.
     """
 
+    push_to_hub: bool = False
     seed: int | None = None
     num_grasp: int = 2
     normalization_mapping: dict[str, NormalizationMode] = field(

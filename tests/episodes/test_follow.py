@@ -372,7 +372,7 @@ def test_rows_of_another_episode_are_never_taken(tmp_path, key):
     [
         (None, "only its name"),
         (b"no picture", "no PNG"),
-        (cv2.imencode(".png", np.zeros((50, 60, 3), np.uint8))[1].tobytes(), r"shape \(50, 60, 3\)"),
+        (cv2.imencode(".png", np.zeros((50, 60, 3), np.uint8))[1].tobytes(), r"shape \(50, 60\)"),
     ],
 )
 def test_pictures_that_cannot_be_read(tmp_path, file, words):
@@ -395,3 +395,34 @@ def test_reading_needs_no_lerobot(tmp_path):
     )
     command = [sys.executable, "-c", code, str(tmp_path / "d")]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "2 []\n"
+
+
+def test_numbers_that_nothing_can_learn_from(tmp_path):
+    new_dataset(tmp_path / "d", 1)
+
+    def damaged(old):
+        rows = old.to_pylist()
+        return pa.array([*rows[:-1], float("nan")], old.type)
+
+    rewrite(tmp_path / "d" / DATA.format(0), with_column("next.reward", damaged))
+    with pytest.raises(DatasetError, match=r"episode 0 in .* numbers that are missing or not finite"):
+        list(read_episodes(tmp_path / "d"))
+
+
+def test_a_data_path_that_leads_elsewhere(tmp_path):
+    new_dataset(tmp_path / "d", 1)
+    info = json.loads((tmp_path / "d/meta/info.json").read_text())
+    (tmp_path / "d/meta/info.json").write_text(json.dumps(info | {"data_path": "../secret/{file_index}.parquet"}))
+    with pytest.raises(DatasetError, match=r"data_path: have \.\./secret/"):
+        read_episodes(tmp_path / "d")
+
+
+@pytest.mark.parametrize("damage", [("dataset_to_index", 10**17), ("length", None), ("data/file_index", "../../etc")])
+def test_places_that_cannot_be(tmp_path, damage):
+    new_dataset(tmp_path / "d", 1)
+    path = tmp_path / "d/meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path, partitioning=None)
+    column, value = damage
+    pq.write_table(table.set_column(table.schema.get_field_index(column), column, pa.array([value])), path)
+    with pytest.raises(DatasetError, match="missing or cut off"):
+        list(read_episodes(tmp_path / "d"))

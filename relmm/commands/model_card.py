@@ -1,0 +1,194 @@
+"""The model card of a checkpoint, made from its run: settings, metrics and dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lerobot
+from huggingface_hub import ModelCard, ModelCardData
+
+from relmm.episodes import UploadedDataset
+from relmm.episodes.card import CITATION, table
+from relmm.features import GRASP_X, GRASP_Y, IMAGE_SIZE, MAX_THETA_VEL, MAX_X_VEL
+from relmm.geometry import camera_geometry
+from relmm.learning.hub import CURVE
+from relmm.learning.progress import read_metrics
+
+_INSTALL = (
+    "pip install -e PATH_TO_A_CHECKOUT_OF_RELMM  # the plugin first: `lerobot_policy_relmm`, or nothing loads this"
+)
+
+
+@dataclass(frozen=True)
+class ModelFacts:
+    """What a card is made from.
+
+    Attributes:
+        repo_id: of the model, `user/name`.
+        settings: of the run, the content of `train_config.json`.
+        metrics: of the run, a `metrics.jsonl`.
+        dataset: what it was trained on; None if that is not shared.
+        license: identifier of the Hub.
+        tags: more than the usual.
+    """
+
+    repo_id: str
+    settings: dict[str, Any]
+    metrics: Path
+    dataset: UploadedDataset | None
+    license: str
+    tags: tuple[str, ...] = ()
+
+
+def model_card(facts: ModelFacts) -> ModelCard:
+    """The README.md of a model."""
+    lines = read_metrics(facts.metrics) if facts.metrics.is_file() else []
+    data = ModelCardData(
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        license=facts.license,
+        tags=["robotics", "lerobot", "relmm", "reinforcement-learning", "mobile-manipulation", *facts.tags],
+        datasets=[facts.dataset.repo_id] if facts.dataset else None,
+    )
+    sections = [
+        f"---\n{data.to_yaml()}\n---",
+        _head(facts),
+        "## Room and camera\n\n" + _room(facts.settings),
+        "## Inputs and outputs\n\n" + _interface(),
+        "## Results\n\n" + _results(facts.settings, lines),
+        "## Training\n\n" + _training(facts, lines),
+        "## Use\n\n" + _use(facts),
+        "## Limits\n\n" + _LIMITS,
+        f"## Licence and citation\n\nLicence: {facts.license}. The method:\n\n{CITATION}",
+    ]
+    return ModelCard("\n\n".join(sections) + "\n", ignore_metadata_errors=False)
+
+
+def _head(facts: ModelFacts) -> str:
+    return f"""# {facts.repo_id}
+
+A policy that drives a LoCoBot about a room and picks things up, learned online from scratch with `relmm`, a
+[LeRobot](https://github.com/huggingface/lerobot) package of ReLMM: an ensemble of networks says where a grasp would
+succeed, a gate decides whether to try, and soft actor-critic navigates to where it would. Rewards come from the robot's
+own sensors; no demonstrations, no reset, no map."""
+
+
+def _room(settings: dict[str, Any]) -> str:
+    robot = settings.get("robot") or {}
+    name = settings["policy"]["camera"]
+    camera = camera_geometry(name)
+    forward, left, up = camera.position
+    width, height = camera.fov
+    geometry = (
+        f"{up} m high, {forward} m forward and {left} m left of the robot's centre, {camera.pitch} degrees down, "
+        f"field of view {width} x {height} degrees"
+    )
+    rows = [
+        ("robot", f"`{robot.get('type')}`"),
+        ("room", f"`{robot.get('room')}`"),
+        ("objects", str(robot.get("num_objects") or "the room's own number")),
+        ("camera", f"`{name}`: {geometry}"),
+    ]
+    return table(("what", "which"), rows)
+
+
+def _interface() -> str:
+    x, y = (f"{low} to {high} m" for low, high in (GRASP_X, GRASP_Y))
+    rows = [
+        ("in", "`observation.images.front`", f"{IMAGE_SIZE}x{IMAGE_SIZE} RGB"),
+        (
+            "in",
+            "`observation.state`",
+            "10 numbers: base velocities (m/s, deg/s), arm joints (deg), gripper (m), holding, bumper",
+        ),
+        ("out", "`x.vel`, `theta.vel`", f"0 to {MAX_X_VEL} m/s forward, up to {MAX_THETA_VEL} deg/s (positive = left)"),
+        ("out", "`skill.pos`", "0 navigate, 1 grasp, 2 place"),
+        (
+            "out",
+            "`skill_x.pos`, `skill_y.pos`",
+            f"where to grasp or place, m in the robot's frame: {x} forward, {y} left",
+        ),
+    ]
+    return table(("", "name", "what"), rows) + "\n\nOne action is one blocking skill; a navigation step takes 0.5 s."
+
+
+def _results(settings: dict[str, Any], lines: list[dict[str, Any]]) -> str:
+    evaluations = [line for line in lines if "eval_collected" in line]
+    if not evaluations:
+        return "The run was not evaluated."
+    seeds = [settings["eval"]["seed"] + index for index in range(len(evaluations[-1]["eval_collected_each"]))]
+    rows = [
+        (
+            str(line["steps"]),
+            f"{line['eval_collected']:.1%} ± {line['eval_collected_std']:.1%}",
+            ", ".join(f"{share:.0%}" for share in line["eval_collected_each"]),
+            f"{line['eval_grasp_success']:.1%}",
+        )
+        for line in evaluations
+    ]
+    head = (
+        "navigation steps",
+        "objects collected",
+        f"each, of seed {', '.join(map(str, seeds))}",
+        "grasps that succeed",
+    )
+    return (
+        "Episodes of 250 navigation steps in the room it was trained in, greedily and without pseudo-resets; mean ± "
+        f"standard deviation over the episodes. One training run, of seed {settings['seed']}.\n\n" + table(head, rows)
+    )
+
+
+def _training(facts: ModelFacts, lines: list[dict[str, Any]]) -> str:
+    settings = facts.settings
+    where = (
+        f"[{facts.dataset.repo_id}](https://huggingface.co/datasets/{facts.dataset.repo_id})" if facts.dataset else ""
+    )
+    dataset = (
+        f"All it has learned from is in {where}, revision `{facts.dataset.revision}`."
+        if facts.dataset
+        else "Its dataset is not shared, so training cannot go on from here."
+    )
+    counts = ""
+    if lines:
+        last = lines[-1]
+        counts = (
+            f" So far: {last['steps']} navigation steps, {last['pseudo_reset_steps']} more in pseudo-resets, "
+            f"{last['attempts']} grasp attempts of which {last['successes']} succeeded, {last['objects']} objects "
+            f"picked up outside the curriculum; objects that a person put into reach: {last['interventions']}."
+        )
+    return (
+        f"Curriculum `{settings['curriculum']['type']}`, seed {settings['seed']}, LeRobot {lerobot.__version__}; "
+        f"all settings are in `train_config.json`, all metrics in `metrics.jsonl`. {dataset}{counts}\n\n"
+        f"![Learning curve: objects collected in evaluations, and training]({CURVE})"
+    )
+
+
+def _use(facts: ModelFacts) -> str:
+    room = (facts.settings.get("robot") or {}).get("room", "no_obstacles")
+    resume = (
+        f"""
+# go on training, with its dataset
+relmm-train --resume=true --policy.path={facts.repo_id} --output_dir=outputs/train/continued --steps=STEPS_IN_ALL
+"""
+        if facts.dataset
+        else ""
+    )
+    return f"""```bash
+{_INSTALL}
+
+# evaluate
+relmm-eval --policy.path={facts.repo_id} --env.room={room}
+{resume}
+# roll out, and record
+lerobot-rollout --robot.type=locobot_sim --robot.room={room} --policy.path={facts.repo_id} --fps=2 \\
+    --task="clean the room" --duration=60
+relmm-record --robot.type=locobot_sim --robot.room={room} --policy.path={facts.repo_id} \\
+    --dataset.repo_id=me/rollouts --dataset.num_episodes=10
+```"""
+
+
+_LIMITS = """- Trained in simulation, in one room with one camera geometry; another camera needs another training.
+- It knows what it can pick up by trying; what it has never met, it may ignore or try in vain.
+- It does not know people, animals, stairs or fragile things: supervise it on a real robot."""

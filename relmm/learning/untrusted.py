@@ -1,0 +1,167 @@
+"""What a policy's folder must look like before anything of it is used: it may come from anybody.
+
+LeRobot would import whatever class a processor's JSON names, load weights that do not fit, and never look for NaN.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from relmm.errors import ConfigError
+from relmm.features import dataset_features
+from relmm.policies.controller import ControllerConfig
+
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+_STEPS = {
+    "rename_observations_processor",
+    "to_batch_processor",
+    "device_processor",
+    "normalizer_processor",
+    "unnormalizer_processor",
+}
+_MAX_JSON = 10 << 20
+_TYPES = {"F32": torch.float32, "F64": torch.float64, "I64": torch.int64, "U8": torch.uint8, "BOOL": torch.bool}
+
+
+def check_policy_folder(folder: Path) -> None:
+    """Refuse a folder that is no policy of relmm, or would run code of its choice when it is loaded.
+
+    Args:
+        folder: what `--policy.path` leads to.
+
+    Raises:
+        ConfigError: with what is wrong.
+    """
+    config = read_json(folder / CONFIG)
+    known = PreTrainedConfig.get_known_choices()
+    own = sorted(name for name, choice in known.items() if issubclass(choice, ControllerConfig))
+    if not isinstance(config, dict) or config.get("type") not in own:
+        kind = config.get("type") if isinstance(config, dict) else config
+        raise ConfigError(
+            f"{folder / CONFIG} is of a policy {kind!r}, and relmm's commands load {', '.join(own)}; "
+            "use lerobot-eval for policies of others."
+        )
+    for name in PROCESSORS:
+        _check_processor(folder / name, read_json(folder / name))
+    if not (folder / WEIGHTS).is_file():
+        raise ConfigError(f"{folder} has no {WEIGHTS}: give the folder of a checkpoint's pretrained_model.")
+
+
+def read_json(path: Path) -> Any:
+    """A small JSON file.
+
+    Raises:
+        ConfigError: missing, too large, or no JSON.
+    """
+    try:
+        if path.stat().st_size > _MAX_JSON:
+            raise ConfigError(f"{path} has {path.stat().st_size / 1e6:.0f} MB, which no policy needs; do not use it.")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{path.parent} has no {path.name}: give the folder of a checkpoint's pretrained_model."
+        ) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path} is no JSON that can be read ({error}); use another checkpoint.") from error
+
+
+def _check_processor(path: Path, pipeline: Any) -> None:
+    steps = pipeline.get("steps") if isinstance(pipeline, dict) else None
+    if not isinstance(steps, list):
+        raise ConfigError(f"{path} describes no processor, it has no list of steps; use another checkpoint.")
+    for step in steps:
+        if not isinstance(step, dict) or step.get("registry_name") not in _STEPS or "class" in step:
+            name = (step.get("class") or step.get("registry_name")) if isinstance(step, dict) else step
+            raise ConfigError(
+                f"{path} has a step {name!r}, and policies of relmm have {', '.join(sorted(_STEPS))}; do not use it."
+            )
+        file = step.get("state_file")
+        if file is not None and (not isinstance(file, str) or Path(file).name != file or Path(file).is_absolute()):
+            raise ConfigError(f"{path} names the file {file!r}, which is not in its folder; do not use it.")
+
+
+def check_features(config: PreTrainedConfig, folder: Path) -> None:
+    """Refuse a policy that expects other pictures, states or actions than relmm's robots have.
+
+    Raises:
+        ConfigError: with the difference.
+    """
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    wanted = dataset_to_policy_features(dataset_features())
+    have = {**(config.input_features or {}), **(config.output_features or {})}
+    for key, feature in have.items():
+        if key not in wanted or tuple(feature.shape) != tuple(wanted[key].shape):
+            there = tuple(wanted[key].shape) if key in wanted else "nothing of that name"
+            raise ConfigError(
+                f"{folder / CONFIG} expects {key} of {tuple(feature.shape)}, and relmm has {there}; use another "
+                "checkpoint."
+            )
+
+
+def check_weights(config: PreTrainedConfig, folder: Path) -> None:
+    """Refuse weights that do not fit the config, before any memory is taken for them.
+
+    Raises:
+        ConfigError: no safetensors, cut off, other keys or shapes, or numbers that are not finite.
+    """
+    from lerobot.policies.factory import get_policy_class
+
+    with torch.device("meta"):  # shapes without memory: the config may claim gigabytes
+        expected = get_policy_class(config.type)(config=config).state_dict()
+    check_tensors(folder / WEIGHTS, expected)
+
+
+def check_tensors(path: Path, expected: Mapping[str, Tensor]) -> None:
+    """Refuse a safetensors file with anything but the expected names, types, shapes, and finite numbers.
+
+    Raises:
+        ConfigError: with the first difference.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            _check_names(path, set(file.keys()), set(expected))
+            for name, tensor in expected.items():
+                _check_like(path, name, file.get_slice(name), tensor)
+            for name in expected:
+                if not torch.isfinite(file.get_tensor(name)).all():
+                    raise ConfigError(f"{path} has numbers in {name} that are not finite; use another checkpoint.")
+    except (SafetensorError, OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(
+            f"{path} is cut off, or no safetensors file ({' '.join(str(error).split())}); use another checkpoint, or "
+            "download it again."
+        ) from error
+
+
+def _check_names(path: Path, have: set[str], want: set[str]) -> None:
+    if have != want:
+        missing, extra = sorted(want - have), sorted(have - want)
+        lists = [
+            f"{len(names)} {what} ({', '.join(names[:3])})"
+            for names, what in ((missing, "missing"), (extra, "too many"))
+            if names
+        ]
+        raise ConfigError(
+            f"{path} does not fit its config: of its tensors {' and '.join(lists)}; use another checkpoint."
+        )
+
+
+def _check_like(path: Path, name: str, stored: Any, wanted: Tensor) -> None:
+    have = (tuple(stored.get_shape()), _TYPES.get(stored.get_dtype(), stored.get_dtype()))
+    want = (tuple(wanted.shape), wanted.dtype)
+    if have != want:
+        raise ConfigError(
+            f"{path} does not fit its config: {name} is {have[1]} {have[0]}, not {want[1]} {want[0]}; "
+            "use another checkpoint."
+        )

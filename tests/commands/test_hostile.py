@@ -1,0 +1,182 @@
+"""Policies from anybody: whatever is wrong with them, a command refuses it in one sentence before anything happens."""
+
+import json
+import pickle
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load, save
+
+from relmm.commands import evaluate, train
+from relmm.commands.policies import make_actor
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+
+WEIGHTS = "model.safetensors"
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("healthy")
+    config = ReLMMConfig(device="cpu", num_members=2, grasp_channels=4, navigation_hidden=8)
+    make_actor(config).save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture
+def policy(healthy, tmp_path) -> dict[str, bytes]:
+    """The files of a policy, to be damaged."""
+    return {path.name: path.read_bytes() for path in healthy.iterdir()}
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys, tmp_path) -> Callable[..., str]:
+    """The one sentence that a command ends in."""
+
+    def call(main: Callable[[], None], *arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["command", *arguments, f"--output_dir={tmp_path / 'out'}"])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert stop.value.code == 2, lines
+        assert [line.startswith("relmm-") for line in lines if "Fetching" not in line] == [True]
+        assert not (tmp_path / "out").exists()
+        return lines[-1]
+
+    return call
+
+
+def changed_config(**changes: object) -> Callable[[dict[str, bytes]], None]:
+    def damage(files: dict[str, bytes]) -> None:
+        files["config.json"] = json.dumps(json.loads(files["config.json"]) | changes).encode()
+
+    return damage
+
+
+def changed_step(**changes: object) -> Callable[[dict[str, bytes]], None]:
+    def damage(files: dict[str, bytes]) -> None:
+        pipeline = json.loads(files["policy_preprocessor.json"])
+        pipeline["steps"][0] |= changes
+        files["policy_preprocessor.json"] = json.dumps(pipeline).encode()
+
+    return damage
+
+
+def changed_weights(change: Callable[[dict[str, torch.Tensor]], object]) -> Callable[[dict[str, bytes]], None]:
+    def damage(files: dict[str, bytes]) -> None:
+        tensors = load(files[WEIGHTS])
+        change(tensors)
+        files[WEIGHTS] = save(tensors)
+
+    return damage
+
+
+def first(tensors: dict[str, torch.Tensor]) -> str:
+    return sorted(name for name in tensors if tensors[name].ndim > 1)[0]
+
+
+def header_claims(size: int) -> bytes:
+    """A file of a few bytes whose header promises a tensor of `size` bytes."""
+    header = json.dumps({"weight": {"dtype": "F32", "shape": [size // 4], "data_offsets": [0, size]}}).encode()
+    return struct.pack("<Q", len(header)) + header + b"\0" * 16
+
+
+class Bomb:
+    """What a pickle could do."""
+
+    def __reduce__(self):
+        return (Path.touch, (Path("/tmp/relmm-was-executed"),))
+
+
+def replaced(name: str, content: bytes) -> Callable[[dict[str, bytes]], object]:
+    return lambda files: files.__setitem__(name, content)
+
+
+DAMAGES: dict[str, tuple[Callable[[dict[str, bytes]], object], str]] = {
+    "another class": (changed_config(type="act"), "a policy 'act', and relmm's commands load relmm, "),
+    "no such class": (changed_config(type="os.system"), "a policy 'os.system'"),
+    "no class": (replaced("config.json", b"{}"), "a policy None"),
+    "another controller": (changed_config(type="relmm_random", num_grasp=2), "No policy can be loaded"),
+    "unknown setting": (changed_config(sudo=True), "sudo"),
+    "setting out of range": (changed_config(num_members=0), "policy.num_members is 0"),
+    "huge networks": (changed_config(grasp_channels=1024, num_members=100), "does not fit its config"),
+    "other pictures": (
+        changed_config(input_features={"observation.images.front": {"type": "VISUAL", "shape": [3, 200, 200]}}),
+        "expects observation.images.front of (3, 200, 200), and relmm has (3, 100, 100)",
+    ),
+    "no JSON": (replaced("config.json", b"\xff\xfe nonsense"), "is no JSON that can be read"),
+    "deep JSON": (replaced("config.json", b"[" * 100_000), "is no JSON that can be read"),
+    "large JSON": (replaced("config.json", b" " * (11 << 20)), "which no policy needs"),
+    "code in a processor": (
+        changed_step(**{"class": "subprocess.Popen", "config": {"args": ["true"]}}),
+        "has a step 'subprocess.Popen'",
+    ),
+    "foreign step": (changed_step(registry_name="tokenizer_processor"), "has a step 'tokenizer_processor'"),
+    "file elsewhere": (changed_step(state_file="../../secret.safetensors"), "which is not in its folder"),
+    "absolute file": (changed_step(state_file="/etc/passwd"), "which is not in its folder"),
+    "no processor": (lambda files: files.pop("policy_preprocessor.json"), "has no policy_preprocessor.json"),
+    "no weights": (lambda files: files.pop(WEIGHTS), "has no model.safetensors"),
+    "missing key": (changed_weights(lambda t: t.pop(first(t))), "1 missing (grasping"),
+    "extra key": (changed_weights(lambda t: t.update(more=torch.zeros(1))), "1 too many (more)"),
+    "wrong shape": (changed_weights(lambda t: t.update({first(t): torch.zeros(3, 3)})), "is torch.float32 (3, 3), not"),
+    "wrong type": (changed_weights(lambda t: t.update({first(t): t[first(t)].double()})), "is torch.float64"),
+    "NaN": (changed_weights(lambda t: t[first(t)].fill_(float("nan"))), "that are not finite"),
+    "truncated": (lambda files: files.update({WEIGHTS: files[WEIGHTS][:-1000]}), "is cut off, or no safetensors"),
+    "10 GB claimed": (replaced(WEIGHTS, header_claims(10 << 30)), "is cut off, or no safetensors"),
+    "10 GB of header": (replaced(WEIGHTS, struct.pack("<Q", 10 << 30) + b"{}"), "is cut off, or no safetensors"),
+    "a pickle": (replaced(WEIGHTS, pickle.dumps(Bomb())), "is cut off, or no safetensors"),
+    "empty": (replaced(WEIGHTS, b""), "is cut off, or no safetensors"),
+}
+
+
+@pytest.mark.parametrize(("damage", "words"), DAMAGES.values(), ids=DAMAGES)
+def test_damaged_policy(tmp_path, policy, refused, damage, words):
+    damage(policy)
+    (tmp_path / "policy").mkdir()
+    for name, content in policy.items():
+        (tmp_path / "policy" / name).write_bytes(content)
+    assert words in refused(evaluate.main, f"--policy.path={tmp_path / 'policy'}", "--eval.n_episodes=1")
+    assert not Path("/tmp/relmm-was-executed").exists()
+
+
+@pytest.mark.parametrize("name", ["code in a processor", "NaN", "another class"])
+def test_damaged_policy_on_the_hub(hub, policy, refused, name):
+    damage, words = DAMAGES[name]
+    damage(policy)
+    hub.create("you/evil", files=policy)
+    assert words in refused(evaluate.main, "--policy.path=you/evil", "--eval.n_episodes=1")
+    assert words in refused(train.main, "--policy.path=you/evil", "--robot.type=locobot_sim")
+
+
+def test_list_of_files_that_leave_their_folder(hub, policy, refused):
+    hub.create("you/evil", files={**policy, "../../evil.json": b"{}"})
+    assert "would leave its folder" in refused(evaluate.main, "--policy.path=you/evil")
+
+
+def test_weights_that_are_too_large_are_not_downloaded(hub, policy, refused, monkeypatch):
+    monkeypatch.setattr("relmm.learning.hub.POLICY_FILES", {"*": 1000})
+    hub.create("you/evil", files=policy)
+    assert "and at most 0 MB are plausible" in refused(evaluate.main, "--policy.path=you/evil")
+    assert not any("/resolve/" in request for request in hub.requests)
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("me/nothing", "the Hub has no model me/nothing that you may read"),
+        ("me/policy@v9", "the model me/policy on the Hub has no revision 'v9'"),
+        ("not a name", "No policy can be loaded from 'not a name'"),
+    ],
+)
+def test_no_such_policy(hub, policy, refused, path, words):
+    hub.create("me/policy", files=policy)
+    assert words in refused(evaluate.main, f"--policy.path={path}")
+
+
+def test_training_cannot_go_on_from_weights_alone(hub, policy, refused):
+    hub.create("me/policy", files=policy)
+    error = refused(train.main, "--resume=true", "--policy.path=me/policy")
+    assert "has no training_state/dataset.json, so training cannot go on from it" in error
