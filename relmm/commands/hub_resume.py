@@ -8,7 +8,7 @@ import shutil
 from fnmatch import fnmatch
 from pathlib import Path
 
-from relmm.episodes import check_trainable, summarize, verify_and_repair
+from relmm.episodes import check_trainable, verify_and_repair
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, RELMM, STATS, TASKS
 from relmm.episodes.hub import download_dataset
 from relmm.errors import ConfigError, DatasetError
@@ -64,11 +64,12 @@ def _make_run(repo_id: str, revision: str, output: Path) -> None:
         _copy_run(model, dataset, source, temporary)
         os.replace(temporary, output)
     except OSError as error:
-        shutil.rmtree(temporary, ignore_errors=True)
         raise DatasetError(
             f"{output} cannot be written ({error.strerror or error}); make room or check the permissions, "
             "then try again."
         ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _copy_run(model: Path, dataset: Path, source: Source, run: Path) -> None:
@@ -82,8 +83,18 @@ def _copy_run(model: Path, dataset: Path, source: Source, run: Path) -> None:
         target = run / "dataset" / file.relative_to(dataset)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
-    report = verify_and_repair(run / "dataset")
-    if report.problems or summarize(run / "dataset").episodes < source.episodes:
-        problems = "; ".join(report.problems) or f"{report.episodes} episodes instead of {source.episodes}"
-        shutil.rmtree(run)
-        raise DatasetError(f"the dataset {source.repo_id} is damaged on the Hub ({problems}); try another revision.")
+    _check_whole(run / "dataset", source)
+
+
+def _check_whole(root: Path, source: Source) -> None:
+    try:
+        report = verify_and_repair(root)
+        problems = report.problems
+        if not problems and report.episodes < source.episodes:
+            problems = [f"it has {report.episodes} episodes instead of {source.episodes}"]
+    except DatasetError as error:
+        problems = [str(error).split(";")[0].replace(str(root), "it")]
+    if problems:
+        raise DatasetError(
+            f"the dataset {source.repo_id} on the Hub is damaged ({'; '.join(problems)}); try another revision."
+        )

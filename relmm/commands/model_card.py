@@ -85,13 +85,14 @@ def _room(settings: dict[str, Any]) -> str:
         f"{up} m high, {forward} m forward and {left} m left of the robot's centre, {camera.pitch} degrees down, "
         f"field of view {width} x {height} degrees"
     )
-    rows = [
-        ("robot", f"`{robot.get('type')}`"),
-        ("room", f"`{robot.get('room')}`"),
-        ("objects", str(robot.get("num_objects") or "the room's own number")),
-        ("camera", f"`{name}`: {geometry}"),
-    ]
-    return table(("what", "which"), rows)
+    rows = [("robot", "one whose life was recorded by another process; see the dataset")]
+    if robot:
+        rows = [
+            ("robot", f"`{robot['type']}`"),
+            ("room", f"`{robot.get('room', 'a real one')}`"),
+            ("objects", str(robot.get("num_objects") or "the room's own number")),
+        ]
+    return table(("what", "which"), [*rows, ("camera", f"`{name}`: {geometry}")])
 
 
 def _interface() -> str:
@@ -142,49 +143,48 @@ def _results(settings: dict[str, Any], lines: list[dict[str, Any]]) -> str:
 
 def _training(facts: ModelFacts, lines: list[dict[str, Any]]) -> str:
     settings = facts.settings
-    where = (
-        f"[{facts.dataset.repo_id}](https://huggingface.co/datasets/{facts.dataset.repo_id})" if facts.dataset else ""
-    )
-    dataset = (
-        f"All it has learned from is in {where}, revision `{facts.dataset.revision}`."
-        if facts.dataset
-        else "Its dataset is not shared, so training cannot go on from here."
-    )
-    counts = ""
-    if lines:
-        last = lines[-1]
-        counts = (
-            f" So far: {last['steps']} navigation steps, {last['pseudo_reset_steps']} more in pseudo-resets, "
-            f"{last['attempts']} grasp attempts of which {last['successes']} succeeded, {last['objects']} objects "
-            f"picked up outside the curriculum; objects that a person put into reach: {last['interventions']}."
-        )
-    return (
+    head = (
         f"Curriculum `{settings['curriculum']['type']}`, seed {settings['seed']}, LeRobot {lerobot.__version__}; "
-        f"all settings are in `train_config.json`, all metrics in `metrics.jsonl`. {dataset}{counts}\n\n"
+        f"all settings are in `train_config.json`, all metrics in `metrics.jsonl`. {_learned_from(facts)}"
+    )
+    if not lines:
+        return head
+    last = lines[-1]
+    return (
+        f"{head} So far: {last['steps']} navigation steps, {last['pseudo_reset_steps']} more in pseudo-resets, "
+        f"{last['attempts']} grasp attempts of which {last['successes']} succeeded, {last['objects']} objects "
+        f"picked up outside the curriculum; objects that a person put into reach: {last['interventions']}.\n\n"
         f"![Learning curve: objects collected in evaluations, and training]({CURVE})"
     )
 
 
+def _learned_from(facts: ModelFacts) -> str:
+    if facts.dataset is None:
+        return "Its dataset is not shared, so training cannot go on from here."
+    name, init = facts.dataset.repo_id, facts.settings["dataset"].get("init")
+    link = f"[{name}](https://huggingface.co/datasets/{name}), revision `{facts.dataset.revision}`"
+    begun = f", and in `{init}`, from which it began" if init else ""
+    return f"What it has learned from is in {link}{begun}."
+
+
 def _use(facts: ModelFacts) -> str:
-    room = (facts.settings.get("robot") or {}).get("room", "no_obstacles")
-    resume = (
-        f"""
+    robot, camera = facts.settings.get("robot") or {}, facts.settings["policy"]["camera"]
+    room = robot.get("room", "no_obstacles")
+    body = f"--robot.type=locobot_sim --robot.room={room} --robot.camera={camera} --policy.path={facts.repo_id}"
+    resume = f"""
 # go on training, with its dataset
 relmm-train --resume=true --policy.path={facts.repo_id} --output_dir=outputs/train/continued --steps=STEPS_IN_ALL
 """
-        if facts.dataset
-        else ""
-    )
     return f"""```bash
 {_INSTALL}
 
 # evaluate
-relmm-eval --policy.path={facts.repo_id} --env.room={room}
-{resume}
+relmm-eval --policy.path={facts.repo_id} --env.room={room} --env.camera={camera}
+{resume if facts.dataset else ""}
 # roll out, and record
-lerobot-rollout --robot.type=locobot_sim --robot.room={room} --policy.path={facts.repo_id} --fps=2 \\
-    --task="clean the room" --duration=60
-relmm-record --robot.type=locobot_sim --robot.room={room} --policy.path={facts.repo_id} \\
+lerobot-rollout {body} \\
+    --fps=2 --task="clean the room" --duration=60
+relmm-record {body} \\
     --dataset.repo_id=me/rollouts --dataset.num_episodes=10
 ```"""
 

@@ -32,10 +32,6 @@ _SPARE_BYTES = 100 << 20  # of the disk, beyond what is downloaded
 _TIMEOUT_S = 100.0  # without a byte from the Hub
 
 
-class OtherContentError(HubError):
-    """The repository holds something that an upload would replace."""
-
-
 def reason(repo: str, revision: str, error: Exception) -> str:
     """Why the Hub did not do it and what to do, as the second half of a sentence without its full stop.
 
@@ -162,7 +158,7 @@ def push_folder(
         private: whether a new repository is; an existing public one is then refused. None for the owner's default.
         replaces: patterns of files that are removed where the folder does not have them; other files stay.
         check: is given a function that reads a JSON file of the repository (None where there is none), and raises
-            OtherContentError if its content must not be replaced. Nobody can write between this check and the commit.
+            HubError if its content must not be replaced. Nobody can write between this check and the commit.
         message: of the commit.
 
     Returns:
@@ -176,7 +172,7 @@ def push_folder(
         api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True)
         info = api.repo_info(repo_id, repo_type=repo_type)
         if private and info.private is False:
-            raise OtherContentError(
+            raise HubError(
                 f"the {repo_type} {repo_id} is public, and a private one was asked for; make it private on the Hub, "
                 "or choose another name."
             )
@@ -247,7 +243,7 @@ def reserve(repo_id: str, repo_type: str, private: bool | None, free_of: str | N
             raise HubError(f"nothing could be uploaded: {why}") from error
         return f"uploads may fail for now: {why}"
     if taken:
-        raise OtherContentError(f"the {repo} on the Hub is another run's already; choose another name for this one.")
+        raise HubError(f"the {repo} on the Hub is another run's already; choose another name for this one.")
     return ""
 
 

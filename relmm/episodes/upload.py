@@ -12,9 +12,9 @@ from relmm.episodes.card import CONTACT_SHEET, dataset_card
 from relmm.episodes.compact import compact
 from relmm.episodes.contact_sheet import draw_contact_sheet
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
-from relmm.episodes.remote import OtherContentError, move_tag, push_folder
+from relmm.episodes.remote import move_tag, push_folder
 from relmm.episodes.settings import FORMAT_VERSION, check_repo_id, check_trainable
-from relmm.errors import DatasetError
+from relmm.errors import DatasetError, HubError
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _refuse_others(folder: DatasetFolder, repo_id: str, episodes: int) -> Callab
         theirs, there = runs_of(relmm), info.get("total_episodes") if isinstance(info, dict) else None
         refuse_other_runs(f"dataset {repo_id}", own, theirs)
         if not isinstance(there, int) or there > episodes:
-            raise OtherContentError(
+            raise HubError(
                 f"the dataset {repo_id} on the Hub has {there} episodes and this one {episodes}, so somebody else goes "
                 "on with it; choose another name for this one."
             )
@@ -102,7 +102,7 @@ def refuse_other_runs(repo: str, own: list[dict[str, Any]], theirs: list[dict[st
         theirs: runs of what is on the Hub.
 
     Raises:
-        OtherContentError: own does not go on from theirs.
+        HubError: own does not go on from theirs.
     """
     if theirs == own[: len(theirs)] and bool(theirs) == bool(own):
         return
@@ -110,7 +110,7 @@ def refuse_other_runs(repo: str, own: list[dict[str, Any]], theirs: list[dict[st
         what = "goes on from this one, so somebody else works with it"
     else:
         what = "comes from another run"
-    raise OtherContentError(f"the {repo} on the Hub {what}; choose another name for this one.")
+    raise HubError(f"the {repo} on the Hub {what}; choose another name for this one.")
 
 
 def recorded_runs(folder: DatasetFolder) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from relmm.episodes import UploadedDataset, check_repo_id
-from relmm.episodes.remote import OtherContentError, download, push_folder, reason
+from relmm.episodes.remote import download, push_folder, reason
 from relmm.episodes.upload import refuse_other_runs, runs_of
 from relmm.errors import ConfigError, HubError
 from relmm.learning.checkpoint import portable_config, pretrained_model, training_state
@@ -124,7 +124,7 @@ def _refuse_others(repo_id: str, source: Source) -> Callable[[Callable[[str], An
         there = read(_DATASET)
         refuse_other_runs(f"model {repo_id}", source.runs, runs_of(there))
         if not isinstance(there.get("step"), int) or there["step"] > source.step:
-            raise OtherContentError(
+            raise HubError(
                 f"the model {repo_id} on the Hub has learned for {there.get('step')} steps and this one for "
                 f"{source.step}, so somebody else goes on with it; choose another --policy.repo_id for this one."
             )

@@ -1,6 +1,8 @@
 """Sharing from the command line: what is uploaded when, and going on on another machine."""
 
 import json
+import resource
+import signal
 import sys
 from pathlib import Path
 
@@ -8,9 +10,18 @@ import numpy as np
 import pytest
 
 from relmm.commands import record, train, upload
+from relmm.commands.hub_resume import take_over_from_hub
+from relmm.commands.policies import make_actor
 from relmm.commands.sharing import Uploads, dataset_arguments
-from relmm.episodes import read_episodes, summarize
+from relmm.episodes import read_episodes, summarize, upload_dataset
+from relmm.episodes.folder import DatasetFolder
+from relmm.episodes.upload import recorded_runs
 from relmm.errors import HubError
+from relmm.learning.checkpoint import save_checkpoint
+from relmm.learning.hub import upload_checkpoint
+from relmm.learning.learner import Learner
+from relmm.learning.replay import Replay
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 TINY = [
     "--robot.type=locobot_sim",
@@ -101,6 +112,98 @@ def test_nobody_uploads_without_being_asked(hub, call, tmp_path):
     )
     assert status == 0, errors
     assert not hub.requests
+
+
+def test_a_recording_is_uploaded_when_asked(hub, call, tmp_path, monkeypatch):
+    for name, value in ONLINE.items():
+        monkeypatch.setenv(name, value)
+    status, printed, errors = call(
+        record.main,
+        "--robot.type=locobot_sim",
+        "--policy.type=relmm_random",
+        "--max_steps=2",
+        "--dataset.num_episodes=2",
+        "--dataset.repo_id=me/room",
+        f"--dataset.root={tmp_path / 'room'}",
+        "--dataset.push_to_hub=true",
+        "--dataset.private=true",
+    )
+    assert status == 0, errors
+    assert "dataset, 2 episodes: http://127.0.0.1" in printed
+    assert hub.repo("me/room", "datasets").private
+
+
+def published_run(hub, tmp_path) -> None:
+    """A checkpoint, of which no weight is trained, and the sample dataset, as its own."""
+    dataset = upload_dataset(SAMPLE, "me/life")
+    actor = make_actor(ReLMMConfig(device="cpu", num_members=2, grasp_channels=4, navigation_hidden=8))
+    learner = Learner(actor.policy, Replay(1000), seed=0)
+    settings = {"policy": {"type": "relmm"}, "dataset": {"repo_id": "me/life"}}
+    counters = {"episodes": 10, "interventions": 0}
+    saved = save_checkpoint(tmp_path / "saved", 7, actor, learner, np.random.default_rng(0), counters, settings)
+    runs = recorded_runs(DatasetFolder(SAMPLE))
+    upload_checkpoint(saved, "me/policy", private=None, dataset=dataset, runs=runs, decorate=lambda folder: None)
+
+
+def with_info(**changes):
+    def damage(files):
+        files["meta/info.json"] = json.dumps(json.loads(files["meta/info.json"]) | changes).encode()
+
+    return damage
+
+
+def without_end(files):
+    files["data/chunk-000/file-000.parquet"] = files["data/chunk-000/file-000.parquet"][:-100]
+
+
+def other_action(files):
+    features = json.loads(files["meta/info.json"])["features"]
+    features["action"]["shape"] = [7]
+    with_info(features=features)(files)
+
+
+DAMAGED_DATASETS = {
+    "version": (with_info(codebase_version="v2.1"), "format: have v2.1, want v3.0"),
+    "shape": (other_action, "column action: have float32 (7,) of"),
+    "path": (with_info(data_path="/etc/{file_index}"), "data_path: have /etc/"),
+    "cut": (without_end, "me/life on the Hub is damaged (no whole episode can be read from it"),
+    "fewer episodes": (lambda files: files.pop("meta/episodes/chunk-000/file-000.parquet"), "on the Hub is damaged"),
+}
+
+
+@pytest.mark.parametrize(("damage", "words"), DAMAGED_DATASETS.values(), ids=DAMAGED_DATASETS)
+def test_a_run_with_a_damaged_dataset_is_refused(hub, call, tmp_path, damage, words):
+    published_run(hub, tmp_path)
+    repo = hub.repo("me/life", "datasets")
+    damage(repo.commits[repo.refs["main"]])
+    out = tmp_path / "out"
+    status, _, errors = call(train.main, "--resume=true", "--policy.path=me/policy", f"--output_dir={out}")
+    assert status == 2
+    assert words in errors.splitlines()[-1]
+    assert errors.splitlines()[-1].startswith("relmm-train: ")
+    assert not out.exists()
+    assert not list(tmp_path.glob(".out*"))
+
+
+def test_a_disk_that_is_full_while_a_run_is_taken_over(hub, call, tmp_path):
+    published_run(hub, tmp_path)
+    out = tmp_path / "out"
+    arguments = ("--resume=true", "--policy.path=me/policy", f"--output_dir={out}")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond it then fails with EFBIG
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        status, _, errors = call(train.main, *arguments)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, previous)
+    assert status == 2
+    assert "make room on the disk and try again" in errors.splitlines()[-1]
+    assert not out.exists()
+    command_line = ["relmm-train", *arguments]
+    take_over_from_hub(command_line)
+    assert summarize(out / "dataset").episodes == 10, "a later attempt completes"
+    assert command_line == ["relmm-train", "--resume=true", f"--output_dir={out}"], "the rest resumes a local run"
 
 
 @pytest.fixture
