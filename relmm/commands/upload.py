@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -91,7 +93,7 @@ class UploadConfig:
         if self.dataset.root is not None:
             return self.dataset.root
         assert self.output_dir is not None
-        settings = _settings(last_checkpoint(self.output_dir / "checkpoints"))["dataset"]
+        settings = _settings(last_checkpoint(self.output_dir / "checkpoints", running=True))["dataset"]
         root = settings["root"] or settings["follow"]
         return Path(root) if root else self.output_dir / "dataset"
 
@@ -102,7 +104,7 @@ def upload(config: UploadConfig) -> None:
         os.nice(_NICENESS)
     limit_waiting()
     # Looked up first: whatever this checkpoint has learned from is in the dataset by now.
-    checkpoint = last_checkpoint(config.output_dir / "checkpoints") if config.output_dir else None
+    checkpoint = _newest(config.output_dir)
     dataset = None
     if config.dataset.repo_id is not None:
         dataset = upload_dataset(
@@ -115,7 +117,7 @@ def upload(config: UploadConfig) -> None:
     if config.policy.repo_id is not None:
         assert checkpoint is not None
         _upload_policy(config, checkpoint, dataset)
-        print(f"policy, step {int(checkpoint.name)}: {_url(config.policy.repo_id)}", flush=True)
+        print(f"policy: {_url(config.policy.repo_id)}", flush=True)
 
 
 def _upload_policy(config: UploadConfig, checkpoint: Path, dataset: UploadedDataset | None) -> None:
@@ -147,6 +149,10 @@ def _upload_policy(config: UploadConfig, checkpoint: Path, dataset: UploadedData
     )
 
 
+def _newest(output_dir: Path | None) -> Path | None:
+    return last_checkpoint(output_dir / "checkpoints", running=True) if output_dir else None
+
+
 def _settings(checkpoint: Path) -> dict[str, Any]:
     settings: dict[str, Any] = read_json(pretrained_model(checkpoint) / "train_config.json")
     return settings
@@ -160,6 +166,7 @@ def _url(path: str) -> str:
 
 def main() -> None:
     """Entry point of `relmm-upload`."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the copy that is uploaded is removed
     run("relmm-upload", UploadConfig, upload)
 
 

@@ -81,7 +81,6 @@ def download(repo_id: str, repo_type: str, revision: str, limits: dict[str, int]
         Exception: of huggingface_hub or its HTTP library; see `reason`.
     """
     from huggingface_hub import constants, snapshot_download
-    from huggingface_hub.errors import IncompleteSnapshotError
 
     def snapshot(**where: Any) -> Path:
         patterns = list(limits)
@@ -94,7 +93,7 @@ def download(repo_id: str, repo_type: str, revision: str, limits: dict[str, int]
     except Exception as unreachable:  # what is in the cache was checked when it came
         try:
             return snapshot(revision=revision, local_files_only=True)
-        except (LocalEntryNotFoundError, IncompleteSnapshotError):
+        except LocalEntryNotFoundError:
             raise unreachable from None
     files = {file.rfilename: file.size or 0 for file in getattr(info, "siblings", None) or []}
     check_listing(f"{repo_type} {repo_id}", files, limits)
@@ -196,6 +195,8 @@ def _remote_json(repo_id: str, repo_type: str, revision: str, name: str) -> Any:
     try:
         path = hf_hub_download(repo_id, name, repo_type=repo_type, revision=revision)
         return json.loads(Path(path).read_text(encoding="utf-8"))
+    except LocalEntryNotFoundError:  # the Hub did not answer: what it has is not known
+        raise
     except EntryNotFoundError:
         return None
     except ValueError:

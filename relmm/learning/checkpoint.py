@@ -77,13 +77,18 @@ def _settle(folder: Path) -> None:
     _link(last, target.name)
 
 
-def last_checkpoint(folder: Path) -> Path:
+def last_checkpoint(folder: Path, running: bool = False) -> Path:
     """The newest checkpoint of a run's `checkpoints` folder.
+
+    Args:
+        folder: of the run.
+        running: another process may be writing checkpoints there: then nothing is tidied up.
 
     Raises:
         ConfigError: there is none.
     """
-    _settle(folder)
+    if not running:
+        _settle(folder)
     last = folder / _LAST
     if not (last / _MODEL / "config.json").is_file():
         raise ConfigError(f"There is no checkpoint in {folder}: check the folder, or train without --resume.")

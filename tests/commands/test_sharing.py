@@ -4,6 +4,7 @@ import json
 import resource
 import signal
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,7 @@ def test_nobody_uploads_without_being_asked(hub, call, tmp_path):
     assert not hub.requests
 
 
+@pytest.mark.slow
 def test_a_recording_is_uploaded_when_asked(hub, call, tmp_path, monkeypatch):
     for name, value in ONLINE.items():
         monkeypatch.setenv(name, value)
@@ -143,6 +145,25 @@ def published_run(hub, tmp_path) -> None:
     saved = save_checkpoint(tmp_path / "saved", 7, actor, learner, np.random.default_rng(0), counters, settings)
     runs = recorded_runs(DatasetFolder(SAMPLE))
     upload_checkpoint(saved, "me/policy", private=None, dataset=dataset, runs=runs, decorate=lambda folder: None)
+
+
+def test_recording_with_a_policy_of_the_hub(hub, call, tmp_path):
+    published_run(hub, tmp_path)
+    revision = hub.repo("me/policy").refs["main"]
+    hub.repo("me/policy").commit({"config.json": b"{}"})
+    status, _, errors = call(
+        record.main,
+        "--robot.type=locobot_sim",
+        f"--policy.path=me/policy@{revision}",
+        "--policy.device=cpu",
+        "--max_steps=2",
+        "--dataset.num_episodes=1",
+        "--dataset.repo_id=me/room",
+        f"--dataset.root={tmp_path / 'room'}",
+    )
+    assert status == 0, errors
+    run = json.loads((tmp_path / "room/meta/relmm.json").read_text())["runs"][0]
+    assert (run["policy"], run["policy_path"]) == ("relmm", f"me/policy@{revision}")
 
 
 def with_info(**changes):
@@ -250,6 +271,24 @@ def test_the_last_upload(hub, fault, background):
     assert said[-1].startswith("dataset, 10 episodes: http://127.0.0.1")
 
 
+@pytest.mark.slow
+def test_the_last_upload_takes_the_place_of_one_under_way(hub, fault, background, tmp_path, monkeypatch):
+    uploads, said = background
+    (tmp_path / "copies").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "copies"))
+    slow = fault("/preupload/", delay_s=60, times=1)
+    hub.faults.append(slow)
+    uploads.begin()
+    while not slow.hits:
+        time.sleep(0.05)
+    assert len(list((tmp_path / "copies").glob("relmm-upload-*"))) == 1
+    started = time.monotonic()
+    uploads.finish()
+    assert time.monotonic() - started < 50
+    assert said[-1].startswith("dataset, 10 episodes: ")
+    assert not list((tmp_path / "copies").glob("relmm-upload-*")), "also the copy of the one that was ended"
+
+
 def test_upload_again_by_hand(hub, call):
     status, printed, errors = call(upload.main, "--dataset.repo_id=me/room", f"--dataset.root={SAMPLE}")
     assert status == 0, errors
@@ -273,7 +312,7 @@ def test_going_on_on_another_machine(hub, run, tmp_path):
         return result
 
     trained = relmm("train", *TINY, *SHARED, "--steps=8", "--hub.every=4", "--seed=3", "--output_dir=first")
-    assert "policy, step 8: http://127.0.0.1" in trained.stdout
+    assert "policy: http://127.0.0.1" in trained.stdout
     evaluation = ("--env.type=relmm_room", "--policy.device=cpu", "--env.navigation_steps=20", "--eval.n_episodes=2")
     relmm("evaluate", *evaluation, "--policy.path=first/checkpoints/last/pretrained_model", "--output_dir=eval_here")
     relmm("evaluate", *evaluation, "--policy.path=me/policy", "--output_dir=eval_there", home="hf_there")

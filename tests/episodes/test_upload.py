@@ -151,6 +151,18 @@ def test_another_dataset_is_not_replaced(tmp_path, hub):
     assert summarize(local_root(NAME)).episodes == 2
 
 
+def test_what_cannot_be_looked_at_is_not_replaced(tmp_path, hub, fault):
+    with DurableDataset.create(REPO_ID, tmp_path / "other", False, "locobot_sim", INFO | {"seed": 4}) as dataset:
+        record(dataset, range(1))
+    upload_dataset(tmp_path / "other", NAME)
+    before = hub.repo(NAME, "datasets").refs["main"]
+    new_dataset(tmp_path / "d", 2)
+    hub.faults.append(fault("/resolve/", status=500))
+    with pytest.raises(HubError, match="nothing was uploaded"):
+        upload_dataset(tmp_path / "d", NAME)
+    assert hub.repo(NAME, "datasets").refs["main"] == before
+
+
 def test_two_writers_at_the_same_moment(tmp_path, hub):
     new_dataset(tmp_path / "d", 1)
     upload_dataset(tmp_path / "d", NAME)
