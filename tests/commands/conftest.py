@@ -28,3 +28,23 @@ def run(tmp_path: Path) -> Run:
         )
 
     return call
+
+
+@pytest.fixture(scope="session")
+def tiny() -> list[str]:
+    """Settings of relmm-train for a run of seconds."""
+    return [
+        "--robot.type=locobot_sim",
+        "--policy.device=cpu",
+        "--policy.num_stationary=6",
+        "--policy.min_attempts_to_update=4",
+        "--policy.min_steps_to_update=4",
+        "--policy.navigation_batch_size=8",
+        "--policy.grasp_batch_size=8",
+        "--policy.random_steps=2",
+        "--pseudo_reset_steps=2",
+        "--replay_frames=2000",
+        "--env_eval_freq=0",
+        "--log_freq=2",
+        "--save_freq=4",
+    ]

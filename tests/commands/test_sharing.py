@@ -24,22 +24,6 @@ from relmm.learning.learner import Learner
 from relmm.learning.replay import Replay
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
-TINY = [
-    "--robot.type=locobot_sim",
-    "--policy.device=cpu",
-    "--policy.num_stationary=6",
-    "--policy.min_attempts_to_update=4",
-    "--policy.min_steps_to_update=4",
-    "--policy.navigation_batch_size=8",
-    "--policy.grasp_batch_size=8",
-    "--policy.random_steps=2",
-    "--pseudo_reset_steps=2",
-    "--replay_frames=2000",
-    "--env_eval_freq=0",
-    "--log_freq=2",
-    "--save_freq=4",
-    "--max_steps=3",
-]
 SHARED = (
     "--policy.push_to_hub=true",
     "--policy.repo_id=me/policy",
@@ -68,11 +52,11 @@ def call(monkeypatch, capsys):
 
 
 @pytest.fixture
-def refused(call, tmp_path):
+def refused(call, tmp_path, tiny):
     """The one sentence in which relmm-train ends before it writes anything."""
 
     def run(*arguments):
-        status, _, errors = call(train.main, *TINY, *arguments, f"--output_dir={tmp_path / 'out'}")
+        status, _, errors = call(train.main, *tiny, "--max_steps=3", *arguments, f"--output_dir={tmp_path / 'out'}")
         assert status == 2
         assert len(errors.splitlines()) == 1
         assert not (tmp_path / "out").exists()
@@ -305,13 +289,15 @@ def test_upload_again_by_hand(hub, call):
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-def test_going_on_on_another_machine(hub, run, tmp_path):
+def test_going_on_on_another_machine(hub, run, tmp_path, tiny):
     def relmm(command, *arguments, home="here"):
         result = run("python", "-m", f"relmm.commands.{command}", *arguments, **ONLINE, HF_HOME=str(tmp_path / home))
         assert result.returncode == 0, result.stderr
         return result
 
-    trained = relmm("train", *TINY, *SHARED, "--steps=8", "--hub.every=4", "--seed=3", "--output_dir=first")
+    trained = relmm(
+        "train", *tiny, "--max_steps=3", *SHARED, "--steps=8", "--hub.every=4", "--seed=3", "--output_dir=first"
+    )
     assert "policy: http://127.0.0.1" in trained.stdout
     evaluation = ("--env.type=relmm_room", "--policy.device=cpu", "--env.navigation_steps=20", "--eval.n_episodes=2")
     relmm("evaluate", *evaluation, "--policy.path=first/checkpoints/last/pretrained_model", "--output_dir=eval_here")

@@ -18,22 +18,6 @@ from relmm.episodes import read_episodes, summarize
 from relmm.features import Phase, Skill
 from relmm.learning.progress import read_metrics
 
-TINY = [
-    "--robot.type=locobot_sim",
-    "--policy.device=cpu",
-    "--policy.num_stationary=6",
-    "--policy.min_attempts_to_update=4",
-    "--policy.min_steps_to_update=4",
-    "--policy.navigation_batch_size=8",
-    "--policy.grasp_batch_size=8",
-    "--policy.random_steps=2",
-    "--pseudo_reset_steps=2",
-    "--replay_frames=2000",
-    "--env_eval_freq=0",
-    "--log_freq=2",
-    "--save_freq=4",
-]
-
 
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "relmm.commands.train", *arguments]
@@ -52,9 +36,9 @@ def recorded(root: Path) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
+def finished(tmp_path_factory, tiny) -> Path:
     folder = tmp_path_factory.mktemp("train") / "run"
-    result = train(*TINY, "--steps=8", f"--output_dir={folder}")
+    result = train(*tiny, "--steps=8", f"--output_dir={folder}")
     assert result.returncode == 0, result.stderr
     return folder
 
@@ -89,17 +73,17 @@ def test_metrics_count_what_the_dataset_holds(finished):
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_equal_seeds_give_equal_runs(finished, tmp_path):
-    assert train(*TINY, "--steps=8", f"--output_dir={tmp_path / 'again'}").returncode == 0
+def test_equal_seeds_give_equal_runs(finished, tmp_path, tiny):
+    assert train(*tiny, "--steps=8", f"--output_dir={tmp_path / 'again'}").returncode == 0
     first, second = weights(finished / "checkpoints" / "last"), weights(tmp_path / "again" / "checkpoints" / "last")
     assert all(np.array_equal(first[key], second[key]) for key in first)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_resume_goes_on_with_all_recorded_steps(tmp_path):
+def test_resume_goes_on_with_all_recorded_steps(tmp_path, tiny):
     folder = tmp_path / "run"
-    assert train(*TINY, "--steps=4", f"--output_dir={folder}").returncode == 0
+    assert train(*tiny, "--steps=4", f"--output_dir={folder}").returncode == 0
     result = train("--resume=true", f"--output_dir={folder}", "--steps=8", "--policy.device=cpu")
     assert result.returncode == 0, result.stderr
     skills = [(e.actions[:, 2].round(), e.phases) for e in read_episodes(folder / "dataset")]
@@ -111,10 +95,10 @@ def test_resume_goes_on_with_all_recorded_steps(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("max_steps", [3, 250], ids=["with saved episodes", "perhaps before the first one"])
-def test_killed_run_resumes(tmp_path, max_steps):
+def test_killed_run_resumes(tmp_path, max_steps, tiny):
     folder = tmp_path / "run"
     process = subprocess.Popen(
-        command(*TINY, "--steps=100000", f"--max_steps={max_steps}", f"--output_dir={folder}"),
+        command(*tiny, "--steps=100000", f"--max_steps={max_steps}", f"--output_dir={folder}"),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -171,10 +155,10 @@ def refused(monkeypatch, capsys) -> Callable[..., str]:
 
 
 @pytest.mark.parametrize(("arguments", "words"), BAD.values(), ids=BAD)
-def test_bad_settings_end_in_one_sentence(tmp_path, refused, arguments, words):
+def test_bad_settings_end_in_one_sentence(tmp_path, refused, arguments, words, tiny):
     folder = tmp_path / "run"
     replaced = ("--policy.",) if "policy.type" in arguments[0] else (arguments[0].partition("=")[0],)
-    kept = [argument for argument in TINY if not argument.startswith(replaced)]
+    kept = [argument for argument in tiny if not argument.startswith(replaced)]
     assert words in refused(*kept, *arguments, f"--output_dir={folder}")
     assert not folder.exists()
 

@@ -126,13 +126,16 @@ def test_pseudo_resets_alone_teach_nothing(make_learner, count_steps) -> None:
 
 
 @pytest.mark.parametrize(("life", "update"), [("rrr dddddddddddd", "navigation"), ("fff dddddddddddd", "grasping")])
-def test_rows_that_are_all_overwritten_do_no_harm(life: str, update: str, make_learner) -> None:
+def test_rows_that_are_all_overwritten_do_no_harm(life: str, update: str, make_learner, count_steps) -> None:
     """A long search without a pseudo-reset, or without an attempt."""
     learner = make_learner(life, capacity=8)
+    counts = count_steps(learner)
     if update == "grasping":
         learner.update_grasping(Phase.LEARNING)
     else:
         learner.update_navigation()
+    updates = learner.config.navigation_updates if update == "navigation" else 0
+    assert counts == {"grasping": 0, "navigation": updates}
 
 
 # --- What it changes -----------------------------------------------------------------------------------------

@@ -231,7 +231,9 @@ def test_a_robot_can_be_connected_again() -> None:
     for _ in range(2):
         robot.connect()
         robot.send_action(action_dict(x_vel=0.2))
+        assert robot.get_observation()["x.vel"] == pytest.approx(0.2, abs=0.02)
         robot.disconnect()
+        assert not robot.is_connected
 
 
 def test_it_is_a_calibrated_robot(robot: LocobotSim) -> None:

@@ -61,11 +61,17 @@ class Maps:
             chosen = unique[outdated[start : min(start + _CHUNK, count)]]
             self._compute(chosen, pictures(chosen))
         slots = frames % self._capacity
-        return torch.from_numpy(self._observations[slots]), torch.from_numpy(self._probabilities[slots])
+        observations, probabilities = self._observations[slots], self._probabilities[slots]
+        lost = self._owners[slots] != frames  # to another frame of this very answer
+        if lost.any():
+            observations[lost], probabilities[lost] = self._look(pictures(frames[lost]))
+        return torch.from_numpy(observations), torch.from_numpy(probabilities)
 
     def _compute(self, frames: Frames, pictures: Tensor) -> None:
         slots = frames % self._capacity
-        self._observations[slots] = self._observer(pictures, self._grasping).cpu().numpy()
-        probabilities = self._grasping.grasp_probability(self._grasping.estimate(pictures))
-        self._probabilities[slots] = probabilities.cpu().numpy()
+        self._observations[slots], self._probabilities[slots] = self._look(pictures)
         self._versions[slots], self._owners[slots] = self.version, frames
+
+    def _look(self, pictures: Tensor) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        probabilities = self._grasping.grasp_probability(self._grasping.estimate(pictures))
+        return self._observer(pictures, self._grasping).cpu().numpy(), probabilities.cpu().numpy()

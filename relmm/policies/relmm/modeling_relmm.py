@@ -133,8 +133,6 @@ class ReLMMPolicy(ControllerPolicy):
             others = batch[IMAGE_KEY][:, 0]
             grasp_loss, logs = self.grasp_loss(*_attempts(batch, attempts), others, self.rng, offline=True)
             losses.append(grasp_loss)
-            if self._maps is not None:
-                self._maps.version += 1
         if steps.any():
             navigation_batch = self._navigation_batch(batch, steps, trails[:, steps])
             noise = torch.randn(2, int(steps.sum()), ACTIONS, device=batch["action"].device)
@@ -173,6 +171,8 @@ class ReLMMPolicy(ControllerPolicy):
     def update(self) -> None:
         """Called after each step of the optimiser."""
         self.navigation.update_targets()
+        if self._maps is not None:
+            self._maps.version += 1
 
     def get_optim_params(self) -> Any:
         """One group for the ensemble and one for the navigation, with their learning rates."""

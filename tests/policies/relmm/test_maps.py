@@ -107,6 +107,12 @@ def test_overwritten_frames_are_not_mistaken_for_new_ones(world: World) -> None:
     assert all(world.fresh([*range(8, 20)], 1)), "12..19 took the places of 0..7"
 
 
+def test_frames_that_share_a_place_are_not_mistaken_for_each_other(world: World) -> None:
+    frames = [0, CAPACITY, 1, 2 * CAPACITY]
+    for _ in range(2):
+        assert all(world.fresh(frames, 1))
+
+
 def test_more_frames_than_a_chunk_are_all_computed(make_world) -> None:
     world = make_world(capacity=COUNT)
     assert all(world.fresh(np.random.default_rng(0).permutation(COUNT).tolist(), 0))
