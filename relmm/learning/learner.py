@@ -126,6 +126,8 @@ class Learner:
         batch = self.navigation_batch(rows)
         if self.config.mirror and self.rng.random() < 0.5:
             batch = batch.mirrored()
+        if self.config.short_sighted_share > 0 and self.config.navigation_encoder == "floor":
+            batch = batch.short_sighted(self.config.short_sighted_share, self.noise)
         noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)
         return self.policy.navigation.loss(batch, noise)
 

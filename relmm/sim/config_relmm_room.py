@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import freeze_after_episode_end
 
 from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, FRONT, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
@@ -20,9 +19,39 @@ if ENV_ID not in gym.registry:
     gym.register(ENV_ID, entry_point="relmm.sim.env:RelmmRoomEnv")
 
 
+class OneEpisode(gym.Wrapper[Any, Any, Any, Any]):
+    """A room that stands still when its episode has ended, until somebody asks for another one.
+
+    `lerobot-eval` steps its rooms until the slowest has ended, and gymnasium meanwhile starts a next episode of the
+    others, whose first reward would count for the last. Only gymnasium resets without arguments. (LeRobot has had
+    `FreezeAfterEpisodeEnd` for this since 0.6.1.)
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._end: tuple[Any, dict[str, Any]] | None = None
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium."""
+        if self._end is not None and not kwargs:
+            return self._end
+        self._end = None
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """See gymnasium; a step after the end changes and earns nothing."""
+        if self._end is not None:
+            observation, info = self._end
+            return observation, 0.0, False, True, info
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
+            self._end = observation, info
+        return observation, reward, terminated, truncated, info
+
+
 def _make_room(gym_kwargs: dict[str, Any]) -> gym.Env[Any, Any]:
     """A room; defined here so that worker processes, which look it up by name, register the environment first."""
-    return gym.make(ENV_ID, disable_env_checker=True, **gym_kwargs)
+    return OneEpisode(gym.make(ENV_ID, disable_env_checker=True, **gym_kwargs))
 
 
 @EnvConfig.register_subclass("relmm_room")
@@ -59,11 +88,8 @@ class RelmmRoomEnvConfig(EnvConfig):
         LocobotSimConfig(room=self.room, num_objects=self.num_objects, camera=self.camera)
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """As LeRobot's own, but a room whose episode has ended stands still until the slowest one has.
-
-        Otherwise gymnasium starts its next episode at once, and the first reward of that one counts for the last.
-        """
-        make = freeze_after_episode_end(partial(_make_room, self.gym_kwargs))
+        """As LeRobot's own, but of `OneEpisode`."""
+        make = partial(_make_room, self.gym_kwargs)
         mode = gym.vector.AutoresetMode.SAME_STEP
         rooms: gym.vector.VectorEnv
         if use_async_envs and n_envs > 1:

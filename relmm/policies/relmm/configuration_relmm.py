@@ -54,6 +54,7 @@ class ReLMMConfig(ControllerConfig):
 
         navigation_encoder: `floor` (map of the floor with grasp probabilities), `paper` or `paper_small` (pictures).
         navigation_hidden: width of the dense layers.
+        orderly_search: where the map shows nothing to grasp, turn to one side only, and once round at most.
         relabel: reward steps without success with the current P[grasp] - 1 instead of -1.
         relabel_failed: also those whose attempts have failed. The ensemble sees what lies there, not the wall behind it
             that keeps the arm away: a step that is rewarded against the evidence is taken for ever.
@@ -71,6 +72,7 @@ class ReLMMConfig(ControllerConfig):
         clip_targets: keep Bellman targets within what rewards of -1 to 0 allow.
         conservative_weight: of conservative Q-learning in `forward`, that is, when LeRobot trains from a dataset alone.
         mirror: learn from mirrored maps of the floor, too.
+        short_sighted_share: of a batch of maps of the floor, in which far things are hidden, to learn how to search.
         refreshed_maps: frames per update whose stored grasp map and P[grasp] are computed anew by the current ensemble,
             the most outdated of the batch first; 0 for the whole batch.
     """
@@ -107,6 +109,7 @@ class ReLMMConfig(ControllerConfig):
     # --- Navigation -----------------------------------------------------------------------------------------
     navigation_encoder: str = "floor"
     navigation_hidden: int = 256
+    orderly_search: bool = True
     relabel: bool = True
     relabel_failed: bool = False
     relabel_terminal: bool = True
@@ -124,6 +127,7 @@ class ReLMMConfig(ControllerConfig):
     clip_targets: bool = True
     conservative_weight: float = 0.5
     mirror: bool = True
+    short_sighted_share: float = 0.5
     refreshed_maps: int = 6
 
     def __post_init__(self) -> None:
@@ -202,6 +206,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "initial_temperature": (_TINY, math.inf),
     "pseudo_reset_share": (0, 0.9),
     "conservative_weight": (0, math.inf),
+    "short_sighted_share": (0, 1),
     "refreshed_maps": (0, math.inf),
 }
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
-from relmm.policies.relmm.encoders import Encoder
-from relmm.policies.relmm.trail import MIRROR
+from relmm.policies.relmm.encoders import NOTICED, SIGHT, Encoder, hide_beyond
+from relmm.policies.relmm.trail import MIRROR, turns_on
 
 ACTIONS = 2  # forward and turn, each -1..1
 _LOG_STD_RANGE = (-5.0, 2.0)
@@ -49,6 +49,21 @@ class NavigationBatch:
             actions=self.actions * sign,
             next_observations=self.next_observations.flip(-1),
             next_trails=self.next_trails * MIRROR.to(sign.device),
+        )
+
+    def short_sighted(self, share: float, rng: torch.Generator) -> NavigationBatch:
+        """The same, but in a share of the steps nothing to grasp is seen beyond some distance; for maps of the floor.
+
+        A room in which much lies about seldom shows what to do where nothing is in view, but a tidied one asks it.
+        """
+        count = len(self.rewards)
+        reach = torch.rand(count, generator=rng) * SIGHT
+        reach[torch.rand(count, generator=rng) >= share] = SIGHT
+        reach = reach.to(self.rewards.device)
+        return replace(
+            self,
+            observations=hide_beyond(self.observations, reach),
+            next_observations=hide_beyond(self.next_observations, reach),
         )
 
 
@@ -135,11 +150,10 @@ class Navigation(nn.Module):
         """Actions -1..1, (batch, 2): sampled, or the mean action without random numbers."""
         with torch.no_grad():
             if rng is None:
-                mean: Tensor = self.mean_actor(self.mean_encoder(observations, trails))[0].tanh()
-                return mean
-            features = self._actor_features(observations, trails)
-            noise = torch.randn(len(observations), ACTIONS, generator=rng).to(features.device)
-            return self.actor.sample(features, noise)[0]
+                mean = self.mean_actor(self.mean_encoder(observations, trails))[0].tanh()
+                return self._search(mean, observations, trails)
+            noise = torch.randn(len(observations), ACTIONS, generator=rng).to(observations.device)
+            return self._sample(observations, trails, noise)[0]
 
     def loss(self, batch: NavigationBatch, noise: Tensor, conservatism: float = 0.0) -> tuple[Tensor, dict[str, float]]:
         """The sum of the critics', the actor's and the temperature's loss; none has gradients in another's weights.
@@ -160,9 +174,7 @@ class Navigation(nn.Module):
         if conservatism > 0:
             critic_loss = critic_loss + conservatism * self._overestimate(features, values)
 
-        actions, log_density = self.actor.sample(
-            self._actor_features(batch.observations, batch.trails, features), noise[0]
-        )
+        actions, log_density = self._sample(batch.observations, batch.trails, noise[0], features)
         # Through the critics to the actions, but not into the critics.
         self.critics.requires_grad_(False)
         reached = self.critics([each.detach() for each in features], actions).amin(dim=0)
@@ -190,7 +202,7 @@ class Navigation(nn.Module):
     def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:
         """R + gamma * (1 - terminal) * (min Q'(o', a') - temperature * log pi(a'|o')), (batch,)."""
         following = (batch.next_observations, batch.next_trails)
-        actions, log_density = self.actor.sample(self._actor_features(*following), noise)
+        actions, log_density = self._sample(*following, noise)
         values = self.targets(self.targets.encode(*following), actions).amin(dim=0)
         targets = batch.rewards + self.config.gamma * batch.continues * (values - temperature * log_density)
         return targets.clamp(-1 / (1 - self.config.gamma), 0.0) if self.config.clip_targets else targets
@@ -209,11 +221,28 @@ class Navigation(nn.Module):
         assert isinstance(encoder, Encoder)
         return encoder
 
-    def _actor_features(self, observations: Tensor, trails: Tensor, shared: list[Tensor] | None = None) -> Tensor:
+    def _sample(
+        self, observations: Tensor, trails: Tensor, noise: Tensor, encoded: list[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Actions of the actor and the log-densities of what it chose, for observations that may be encoded already."""
         if self.actor_encoder is not None:
-            features: Tensor = self.actor_encoder(observations, trails)
-            return features
-        return (self.critics.encode(observations, trails) if shared is None else shared)[0].detach()
+            features = self.actor_encoder(observations, trails)
+        else:
+            features = (self.critics.encode(observations, trails) if encoded is None else encoded)[0].detach()
+        actions, log_density = self.actor.sample(features, noise)
+        return self._search(actions, observations, trails), log_density
+
+    def _search(self, actions: Tensor, observations: Tensor, trails: Tensor) -> Tensor:
+        """Actions that, where the map shows nothing to grasp, turn only as `turns_on` allows: once round at most.
+
+        There left and right are worth nearly the same. A policy that follows the slightest difference turns to and fro
+        before a bare wall, or in circles, for ever.
+        """
+        if not (self.config.orderly_search and self.config.navigation_encoder == "floor"):
+            return actions
+        nothing = observations[:, 0].flatten(1).amax(dim=1) < NOTICED
+        forward, turn = actions.unbind(dim=1)
+        return torch.stack([forward, torch.where(nothing, turns_on(trails) * (1 + turn) / 2, turn)], dim=1)
 
 
 def _follow(mean: nn.Module, module: nn.Module, rate: float) -> None:

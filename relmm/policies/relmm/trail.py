@@ -12,17 +12,31 @@ from collections import deque
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from relmm.features import DRIVE_PULSE_S
+from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL
 
 # Navigation steps; turning round takes 14. Odd ones too, or turning left and right by turns would look like standing
 # still.
 _LAGS = (1, 2, 3, 5, 9, 17, 33)
 HISTORY = max(_LAGS)
-_MAX_TURNS = 2.0  # turns to either side that still make a difference
+_MAX_TURNS = 2.0  # half turns to either side that still make a difference
 
 TRAIL_FEATURES = 3 * len(_LAGS)
 MIRROR = torch.tensor([1.0, -1.0, -1.0] * len(_LAGS))  # what exchanging left and right does to the features
+
+
+def turns_on(features: Tensor) -> Tensor:
+    """How far the robot may turn to look round, shares of a step's most, positive to the left, (batch,).
+
+    To the side of the last turn, until the remembered steps make a whole turn: then it has seen what there is.
+
+    Args:
+        features: `Trail.features`, (batch, 21).
+    """
+    side = torch.where(features[:, 2] <= 0, 1.0, -1.0)
+    left_over = (_MAX_TURNS - features[:, -1].abs()) * 180 / (MAX_THETA_VEL * DRIVE_PULSE_S)
+    return side * left_over.clamp(0, 1)
 
 
 class Trail:

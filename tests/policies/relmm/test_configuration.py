@@ -43,6 +43,7 @@ PAPER: dict[str, Any] = {
     # 4.2 and the authors' SAC.
     "navigation_encoder": "paper",
     "navigation_hidden": 512,
+    "orderly_search": False,
     "relabel": True,
     "relabel_failed": True,
     "relabel_terminal": False,
@@ -59,6 +60,7 @@ PAPER: dict[str, Any] = {
     "initial_temperature": 1.0,
     "clip_targets": False,
     "mirror": False,
+    "short_sighted_share": 0.0,
     "refreshed_maps": 0,
 }
 SMALL = {"grasp_channels": 32, "grasp_batch_size": 64, "navigation_encoder": "paper_small", "navigation_batch_size": 64}

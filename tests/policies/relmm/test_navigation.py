@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
-from relmm.policies.relmm.encoders import Encoder, FloorObserver, PictureObserver
+from relmm.policies.relmm.encoders import SIGHT, Encoder, FloorObserver, PictureObserver
 from relmm.policies.relmm.navigation import Actor, Navigation, NavigationBatch
 from relmm.policies.relmm.trail import TRAIL_FEATURES
 
@@ -332,6 +332,66 @@ def test_average_over_nothing_is_the_actor_itself(kind: str, make_navigation) ->
             weight += 0.1 * torch.randn_like(weight)
     navigation.update_targets()
     assert torch.allclose(navigation.act(*seen, None), policy_at(navigation, *seen).base_dist.loc.tanh())
+
+
+# --- Search --------------------------------------------------------------------------------------------------
+def with_turns(batch: NavigationBatch, turns: list[float], graspability: int) -> NavigationBatch:
+    """The batch after turns to the left, with nothing better to grasp than this."""
+    batch.observations[:, 0] = batch.observations[:, 0].clamp(max=graspability)
+    batch.observations[:, 0, 4, 7] = graspability
+    batch.trails[:, 2] = -torch.tensor(turns).double()
+    batch.trails[:, -1] = 0
+    return batch
+
+
+@pytest.mark.parametrize(("graspability", "keep", "bound"), [(63, True, True), (64, True, False), (63, False, False)])
+@pytest.mark.parametrize("sample", [True, False])
+def test_where_nothing_is_in_view_the_robot_turns_on(graspability, keep, bound, sample, make_navigation) -> None:
+    """Greedily and sampled; forward, and the order of the turns, are left as they are."""
+    turns = [0.1, -0.1, 0.2, -0.01, 0.0]
+    free, kept = (make_navigation(orderly_search=on) for on in (False, keep))
+    seen = before(with_turns(make_batch(), turns, graspability))
+    wanted, actions = (n.act(*seen, torch.Generator().manual_seed(0) if sample else None) for n in (free, kept))
+    assert torch.equal(actions[:, 0], wanted[:, 0])
+    sides = torch.tensor([1, -1, 1, -1, 1]).double()
+    assert torch.allclose(actions[:, 1], sides * (1 + wanted[:, 1]) / 2 if bound else wanted[:, 1])
+
+
+def test_actor_learns_by_the_turns_that_are_made(make_navigation: MakeNavigation) -> None:
+    """Its loss is that of the kept turns, at this observation and, in the targets, at the next."""
+    navigation, noise = make_navigation(clip_targets=False), make_noise()
+    batch = with_turns(make_batch(), [0.1, -0.1, 0.2, -0.01, 0.0], 30)
+    batch.next_observations, batch.next_trails = batch.observations, batch.trails
+    sides = torch.tensor([1, -1, 1, -1, 1]).double()
+    made = []
+    for each in noise:
+        raw, log_density = act_at(navigation, before(batch), each)
+        made.append((torch.stack([raw[:, 0], sides * (1 + raw[:, 1]) / 2], dim=1), log_density))
+    (actions, density), (following, next_density) = made
+    first, second = values_at(navigation.critics, before(batch), actions)
+    wanted = (0.1 * density - torch.minimum(first, second)).mean().item()
+    assert navigation.loss(batch, noise)[1]["actor_loss"] == pytest.approx(wanted)
+    first, second = values_at(navigation.targets, before(batch), following)
+    value = torch.minimum(first, second) - 0.1 * next_density
+    targets = navigation.bellman_targets(batch, noise[1], torch.tensor(0.1, dtype=torch.double))
+    assert torch.allclose(targets, batch.rewards + navigation.config.gamma * batch.continues * value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("row", [3, 12, 26])
+def test_short_sight_hides_what_is_far_before_and_after_a_step(row: int, share: float) -> None:
+    count = 2000
+    maps = torch.full((count, *FloorObserver.shape), 100, dtype=torch.uint8)
+    numbers, trails = torch.zeros(count), torch.zeros(count, TRAIL_FEATURES)
+    batch = NavigationBatch(maps, trails, torch.zeros(count, 2), numbers, maps, trails, numbers)
+    seen = batch.short_sighted(share, torch.Generator().manual_seed(0))
+    hidden = seen.observations[:, 0, row, 15] == 0
+    distance = (row - 1 + 0.5 - 15 / 14) * 7 * 0.165 / 15  # m; the grasp area is 16.5 cm deep
+    assert hidden.float().mean().item() == pytest.approx(share * distance / SIGHT, abs=0.04)
+    assert torch.equal(seen.observations, seen.next_observations)
+    assert torch.equal(seen.observations[:, 1:], maps[:, 1:])
+    assert seen.actions is batch.actions
+    assert seen.trails is trails
 
 
 # --- Mirror --------------------------------------------------------------------------------------------------
