@@ -183,6 +183,24 @@ def test_vectorised_rooms_give_what_single_ones_give() -> None:
         env.close()
 
 
+def test_room_stands_still_after_its_episode_until_another_is_asked_for() -> None:
+    """As lerobot-eval steps it until the slowest room has ended, and gymnasium resets it meanwhile."""
+    rooms_ = RelmmRoomEnvConfig(num_objects=5, navigation_steps=3).create_envs(2)["relmm_room"][0]
+    first = rooms_.reset(seed=[3, 4])[0]
+    drive = np.stack([drives(1)[0]] * 2)
+    ends = [bool(rooms_.step(drive)[3].all()) for _ in range(3)]
+    assert ends == [False, False, True]
+    seen, rewards, _, truncated, info = rooms_.step(drive)
+    again = rooms_.step(drive)[0]
+    assert rewards.tolist() == [0.0, 0.0]
+    assert truncated.all()
+    assert info["final_info"]["navigation_steps"].tolist() == [3, 3]
+    np.testing.assert_array_equal(seen["pixels"]["front"], again["pixels"]["front"])
+    np.testing.assert_array_equal(rooms_.reset(seed=[3, 4])[0]["pixels"]["front"], first["pixels"]["front"])
+    assert not rooms_.step(drive)[3].any()
+    rooms_.close()
+
+
 # --- Configuration -------------------------------------------------------------------------------------------
 def test_a_room_of_another_package_works(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rooms, "_ROOMS", dict(rooms._ROOMS))
