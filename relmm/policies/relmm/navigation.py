@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import NOTICED, SIGHT, Encoder, hide_beyond
-from relmm.policies.relmm.trail import MIRROR, turns_on
+from relmm.policies.relmm.trail import MIRROR, last_sides
 
 ACTIONS = 2  # forward and turn, each -1..1
 _LOG_STD_RANGE = (-5.0, 2.0)
@@ -233,16 +233,16 @@ class Navigation(nn.Module):
         return self._search(actions, observations, trails), log_density
 
     def _search(self, actions: Tensor, observations: Tensor, trails: Tensor) -> Tensor:
-        """Actions that, where the map shows nothing to grasp, turn only as `turns_on` allows: once round at most.
+        """Actions that, where the map shows nothing to grasp, turn only to the side of the last turn.
 
         There left and right are worth nearly the same. A policy that follows the slightest difference turns to and fro
-        before a bare wall, or in circles, for ever.
+        before a bare wall for ever.
         """
         if not (self.config.orderly_search and self.config.navigation_encoder == "floor"):
             return actions
         nothing = observations[:, 0].flatten(1).amax(dim=1) < NOTICED
         forward, turn = actions.unbind(dim=1)
-        return torch.stack([forward, torch.where(nothing, turns_on(trails) * (1 + turn) / 2, turn)], dim=1)
+        return torch.stack([forward, torch.where(nothing, last_sides(trails) * (1 + turn) / 2, turn)], dim=1)
 
 
 def _follow(mean: nn.Module, module: nn.Module, rate: float) -> None:

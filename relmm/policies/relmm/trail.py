@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL
+from relmm.features import DRIVE_PULSE_S
 
 # Navigation steps; turning round takes 14. Odd ones too, or turning left and right by turns would look like standing
 # still.
@@ -26,17 +26,13 @@ TRAIL_FEATURES = 3 * len(_LAGS)
 MIRROR = torch.tensor([1.0, -1.0, -1.0] * len(_LAGS))  # what exchanging left and right does to the features
 
 
-def turns_on(features: Tensor) -> Tensor:
-    """How far the robot may turn to look round, shares of a step's most, positive to the left, (batch,).
-
-    To the side of the last turn, until the remembered steps make a whole turn: then it has seen what there is.
+def last_sides(features: Tensor) -> Tensor:
+    """To which side the last step turned, 1 for the left and -1 for the right, (batch,).
 
     Args:
         features: `Trail.features`, (batch, 21).
     """
-    side = torch.where(features[:, 2] <= 0, 1.0, -1.0)
-    left_over = (_MAX_TURNS - features[:, -1].abs()) * 180 / (MAX_THETA_VEL * DRIVE_PULSE_S)
-    return side * left_over.clamp(0, 1)
+    return torch.where(features[:, 2] <= 0, 1.0, -1.0)
 
 
 class Trail:

@@ -340,7 +340,6 @@ def with_turns(batch: NavigationBatch, turns: list[float], graspability: int) ->
     batch.observations[:, 0] = batch.observations[:, 0].clamp(max=graspability)
     batch.observations[:, 0, 4, 7] = graspability
     batch.trails[:, 2] = -torch.tensor(turns).double()
-    batch.trails[:, -1] = 0
     return batch
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL, MAX_X_VEL
-from relmm.policies.relmm.trail import MIRROR, TRAIL_FEATURES, Trail, turns_on
+from relmm.policies.relmm.trail import MIRROR, TRAIL_FEATURES, Trail, last_sides
 
 LAGS = (1, 2, 3, 5, 9, 17, 33)
 STEP = MAX_X_VEL * DRIVE_PULSE_S  # m
@@ -93,18 +93,13 @@ def test_mirrored_drive_has_the_mirrored_trail() -> None:
     assert mirrored.flatten() == pytest.approx(after(*steps).flatten() * MIRROR.numpy(), abs=1e-6)
 
 
-@pytest.mark.parametrize("side", [1, -1])
-def test_looking_round_goes_on_to_the_same_side_until_it_is_done(side: int) -> None:
-    """A whole turn takes 13 steps and a third; when its first step is forgotten, there is room for another."""
-    trail, allowed = Trail(), []
-    for _ in range(35):
-        turn = turns_on(torch.from_numpy(trail.features()[None])).item() if allowed else side
-        allowed.append(turn)
-        trail.moved(0.2, turn * MAX_THETA_VEL)
-    assert allowed[:13] == pytest.approx([side] * 13, abs=1e-4)
-    assert allowed[13] == pytest.approx(side * (360 / 27 - 13), abs=1e-3)
-    assert allowed[14:34] == pytest.approx([0.0] * 20, abs=1e-3)
-    assert abs(allowed[34]) == pytest.approx(1.0, abs=1e-3)
+@pytest.mark.parametrize(("theta_vel", "side"), [(40.0, 1), (-40.0, -1), (0.5, 1), (-0.5, -1)])
+def test_last_side_is_that_of_the_last_turn(theta_vel: float, side: int) -> None:
+    trail = Trail()
+    assert last_sides(torch.from_numpy(trail.features()[None])).item() == 1
+    for step in (-side * 90.0, theta_vel):
+        trail.moved(0.2, step)
+    assert last_sides(torch.from_numpy(trail.features()[None])).item() == side
 
 
 def test_copy_goes_its_own_way() -> None:
