@@ -35,8 +35,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (12 minutes)
 	$(BIN)/relmm-train --robot.type=locobot_sim --robot.room=no_obstacles --dataset.repo_id=demo/no_obstacles \
 	  --steps=$(DEMO_STEPS) --seed=0 --output_dir=$(DEMO_DIR)/train
+# An untrained robot grasps at everything: 40 navigation steps of that are enough to see.
 	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/000000/pretrained_model --env.room=no_obstacles \
-	  --eval.n_episodes=1 --seed=0 --output_dir=$(DEMO_DIR)/before
+	  --env.navigation_steps=40 --eval.n_episodes=1 --seed=0 --output_dir=$(DEMO_DIR)/before
 	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/last/pretrained_model --env.room=no_obstacles \
 	  --eval.n_episodes=3 --seed=0 --output_dir=$(DEMO_DIR)/after
 	@$(BIN)/python -m relmm.commands.demo $(DEMO_DIR)/before $(DEMO_DIR)/after $(DEMO_DIR)/before_and_after.mp4
