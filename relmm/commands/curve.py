@@ -46,7 +46,7 @@ def _draw_training(axes: Any, lines: list[dict[str, Any]]) -> None:
             points.append((line["steps"], 100 * objects / steps, 100 * successes / max(attempts, 1)))
     if points:
         at, objects_per_100, success = zip(*points, strict=True)
-        axes.plot(at, objects_per_100, label="objects per 100 steps")
-        axes.plot(at, success, label="successful grasps, %", linestyle="--")
+        axes.plot(at, objects_per_100, marker=".", label="objects per 100 steps")
+        axes.plot(at, success, label="successful grasps, %", linestyle="--", marker=".")
         axes.legend(fontsize=8)
     axes.set(title="training", xlabel="navigation steps", ylim=(0, 105))
