@@ -30,6 +30,17 @@ _POINT_FEATURES = 256
 _CONVOLUTION_FEATURES = 128
 
 
+def _places() -> Tensor:
+    """Where the map's pixels are: forward and left of the grasp area's middle, m, (2, 30, 31)."""
+    forward, left = (_CELLS * (high - low) / GRID for low, high in (GRASP_X, GRASP_Y))  # m, a pixel
+    rows = (torch.arange(_ROWS) - _NEAR_ROWS + 0.5 - GRID / 2 / _CELLS) * forward
+    columns = (torch.arange(_COLUMNS) - _COLUMNS // 2) * left
+    return torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
+
+
+_PLACES = _places()
+
+
 class PictureObserver(nn.Module):
     """The paper's observation: the picture itself."""
 
@@ -108,17 +119,9 @@ def hide_beyond(maps: Tensor, reach: Tensor) -> Tensor:
 
     Their colours stay: averaged over a pixel, small things hardly show in them.
     """
-    distances = _places().norm(dim=0).to(maps.device)
+    distances = _PLACES.norm(dim=0).to(maps.device)
     graspable = maps[:, :1] * (distances <= reach[:, None, None, None])
     return torch.cat([graspable, maps[:, 1:]], dim=1)
-
-
-def _places() -> Tensor:
-    """Where the map's pixels are: forward and left of the grasp area's middle, m, (2, 30, 31)."""
-    forward, left = (_CELLS * (high - low) / GRID for low, high in (GRASP_X, GRASP_Y))  # m, a pixel
-    rows = (torch.arange(_ROWS) - _NEAR_ROWS + 0.5 - GRID / 2 / _CELLS) * forward
-    columns = (torch.arange(_COLUMNS) - _COLUMNS // 2) * left
-    return torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
 
 
 def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
@@ -138,7 +141,7 @@ class Keypoints(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.places: Tensor
-        self.register_buffer("places", _places().flatten(1), persistent=False)
+        self.register_buffer("places", _PLACES.flatten(1), persistent=False)
         self.look = nn.Conv2d(FloorObserver.shape[0], _HEADS, 1, bias=False)
         with torch.no_grad():
             self.look.weight.mul_(0.1)

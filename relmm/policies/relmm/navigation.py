@@ -58,7 +58,7 @@ class NavigationBatch:
         """
         count = len(self.rewards)
         reach = torch.rand(count, generator=rng) * SIGHT
-        reach[torch.rand(count, generator=rng) >= share] = SIGHT
+        reach[torch.rand(count, generator=rng) >= share] = math.inf
         reach = reach.to(self.rewards.device)
         return replace(
             self,

@@ -389,6 +389,7 @@ def test_short_sight_hides_what_is_far_before_and_after_a_step(row: int, share: 
     assert hidden.float().mean().item() == pytest.approx(share * distance / SIGHT, abs=0.04)
     assert torch.equal(seen.observations, seen.next_observations)
     assert torch.equal(seen.observations[:, 1:], maps[:, 1:])
+    assert share > 0 or torch.equal(seen.observations, maps), "to the corners"
     assert seen.actions is batch.actions
     assert seen.trails is trails
 
