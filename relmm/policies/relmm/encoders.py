@@ -38,9 +38,6 @@ def _places() -> Tensor:
     return torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
 
 
-_PLACES = _places()
-
-
 class PictureObserver(nn.Module):
     """The paper's observation: the picture itself."""
 
@@ -119,7 +116,7 @@ def hide_beyond(maps: Tensor, reach: Tensor) -> Tensor:
 
     Their colours stay: averaged over a pixel, small things hardly show in them.
     """
-    distances = _PLACES.norm(dim=0).to(maps.device)
+    distances = _places().norm(dim=0).to(maps.device)
     graspable = maps[:, :1] * (distances <= reach[:, None, None, None])
     return torch.cat([graspable, maps[:, 1:]], dim=1)
 
@@ -141,7 +138,7 @@ class Keypoints(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.places: Tensor
-        self.register_buffer("places", _PLACES.flatten(1), persistent=False)
+        self.register_buffer("places", _places().flatten(1), persistent=False)
         self.look = nn.Conv2d(FloorObserver.shape[0], _HEADS, 1, bias=False)
         with torch.no_grad():
             self.look.weight.mul_(0.1)
