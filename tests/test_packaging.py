@@ -69,7 +69,7 @@ def test_lerobot_discovers_every_part(tmp_path):
 def test_command_shows_its_help(command, tmp_path):
     done = run(Path(sysconfig.get_path("scripts")) / command, "--help", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "usage" in done.stdout.lower()
+    assert command in done.stdout
 
 
 def test_constraints_fit_what_the_package_asks_for():

@@ -1,0 +1,110 @@
+"""Entry points of the commands: `--help` answers at once, everything else loads LeRobot, which takes seconds."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+SHORT_HELP = {
+    "relmm-train": """\
+relmm-train: a robot is put into a room and learns to clean it.
+
+  relmm-train --robot.type=locobot_sim --robot.room=no_obstacles
+  relmm-train --output_dir=FOLDER --resume=true
+
+  --robot.room=NAME             no_obstacles, obstacles, diverse, obstacles_rugs
+  --robot.num_objects=N         that lie about
+  --config_path=fast            or paper, paper_small, a file
+  --policy.path=DIR             or user/repo[@revision]: go on from its weights
+  --policy.device=cpu           or cuda, mps
+  --curriculum.type=stationary  or autonomous, none
+  --steps=2000                  navigation steps
+  --seed=0                      of everything random
+  --env_eval_freq=500           steps between evaluations in the room; 0 for none
+  --eval.n_episodes=3           episodes each time
+  --output_dir=FOLDER           new; else outputs/train/DATE/TIME_relmm
+  --resume=true                 go on with the run in that folder
+  --dataset.repo_id=USER/NAME   name of the dataset that is recorded while learning
+  --dataset.init=PATH_OR_REPO   a dataset to learn from first
+  --dataset.follow=PATH         a dataset that another process is recording, instead of a robot
+  --dataset.push_to_hub=true    upload it
+  --policy.push_to_hub=true     upload the checkpoint to --policy.repo_id=USER/NAME
+  --hub.every=STEPS             upload while training, too
+""",
+    "relmm-eval": """\
+relmm-eval: how much of a room a policy cleans, with videos.
+
+  relmm-eval --policy.path=outputs/train/DATE/TIME_relmm/checkpoints/last/pretrained_model --env.room=no_obstacles
+
+  --policy.path=DIR             or user/repo[@revision]
+  --policy.type=relmm_scripted  or relmm_random: policies without weights
+  --policy.sample=true          sampled actions instead of greedy ones (relmm)
+  --env.room=NAME               no_obstacles, obstacles, diverse, obstacles_rugs
+  --env.num_objects=N           that lie about
+  --env.navigation_steps=250    length of an episode
+  --eval.n_episodes=10          of the seeds --seed, --seed + 1, ...
+  --eval.n_videos=1             of them filmed
+  --seed=1000                   of the first episode
+  --output_dir=FOLDER           new; else outputs/eval/DATE/TIME_ROOM_POLICY
+""",
+    "relmm-record": """\
+relmm-record: record a robot's life as a LeRobot dataset.
+
+  relmm-record --robot.type=locobot_sim --robot.room=no_obstacles --policy.type=relmm_scripted \\
+      --dataset.repo_id=USER/NAME --dataset.num_episodes=20
+
+  --robot.room=NAME             no_obstacles, obstacles, diverse, obstacles_rugs
+  --policy.type=relmm_scripted  or relmm_random
+  --policy.path=DIR             or user/repo[@revision]; checkpoints/last of a running training is followed
+  --dataset.repo_id=USER/NAME   name of the dataset
+  --dataset.root=FOLDER         where it goes; else where LeRobot keeps datasets
+  --dataset.num_episodes=N      to record in this run
+  --dataset.push_to_hub=true    upload it at the end
+  --max_steps=250               navigation steps after which an episode is cut off
+  --pseudo_reset_steps=20       random steps before and after an object is put down again
+  --seed=0                      of everything random
+  --resume=true                 go on with the dataset in its folder
+""",
+    "relmm-upload": """\
+relmm-upload: upload the newest checkpoint of a run, and a dataset; what is on the Hub already is not sent again.
+
+  relmm-upload --output_dir=FOLDER --policy.repo_id=USER/NAME --dataset.repo_id=USER/NAME
+  relmm-upload --dataset.root=FOLDER --dataset.repo_id=USER/NAME
+
+  --output_dir=FOLDER           of a run of relmm-train, which may be running
+  --policy.repo_id=USER/NAME    where the checkpoint goes
+  --policy.private=true         a new repository is private
+  --dataset.root=FOLDER         the dataset, if it is not that of the run
+  --dataset.repo_id=USER/NAME   where it goes
+  --dataset.private=true        a new repository is private
+  --dataset.license=apache-2.0  for the card
+""",
+}
+
+
+def train() -> None:
+    """Entry point of `relmm-train`."""
+    _start("relmm-train", "train")
+
+
+def evaluate() -> None:
+    """Entry point of `relmm-eval`."""
+    _start("relmm-eval", "evaluate")
+
+
+def record() -> None:
+    """Entry point of `relmm-record`."""
+    _start("relmm-record", "record")
+
+
+def upload() -> None:
+    """Entry point of `relmm-upload`."""
+    _start("relmm-upload", "upload")
+
+
+def _start(command: str, module: str) -> None:
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        print(f"{SHORT_HELP[command]}\n{command} --help_all lists every option.")
+        return
+    sys.argv = ["--help" if argument == "--help_all" else argument for argument in sys.argv]
+    import_module(f"relmm.commands.{module}").main()
