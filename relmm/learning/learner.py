@@ -123,11 +123,7 @@ class Learner:
             chosen = replay.sample(replay.pseudo_reset_steps, others, self.rng)
             more = replay.pseudo_reset_steps.rows(chosen)
             rows = {name: np.concatenate([rows[name], more[name]]) for name in rows}
-        batch = self.navigation_batch(rows)
-        if self.config.mirror and self.rng.random() < 0.5:
-            batch = batch.mirrored()
-        if self.config.short_sighted_share > 0 and self.config.navigation_encoder == "floor":
-            batch = batch.short_sighted(self.config.short_sighted_share, self.noise)
+        batch = self.policy.augmented(self.navigation_batch(rows), self.noise)
         noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)
         return self.policy.navigation.loss(batch, noise)
 

@@ -278,7 +278,8 @@ def test_frozen_ensemble_learns_from_recorded_curricula_only(make_learner, recor
 
 def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> None:
     """LeRobot's dataset, batches and preprocessor against the replay, for odometry that agrees with the actions."""
-    policy = make_policy(refreshed_maps=0, background_weight=0.0, conservative_weight=0.0, seed=2)
+    alone = {"background_weight": 0.0, "conservative_weight": 0.0, "mirror": False, "tidied_share": 0.0}
+    policy = make_policy(refreshed_maps=0, **alone, seed=2)
     deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
     columns = dict.fromkeys((IMAGE_KEY, "next.reward"), deltas)
     columns["action"] = [delta / FPS for delta in policy.config.action_delta_indices]

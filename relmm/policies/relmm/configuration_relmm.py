@@ -72,7 +72,7 @@ class ReLMMConfig(ControllerConfig):
         clip_targets: keep Bellman targets within what rewards of -1 to 0 allow.
         conservative_weight: of conservative Q-learning in `forward`, that is, when LeRobot trains from a dataset alone.
         mirror: learn from mirrored maps of the floor, too.
-        short_sighted_share: of a batch of maps of the floor, in which far things are hidden, to learn how to search.
+        tidied_share: of a batch of maps of the floor, in which part of what lay about is gone, to learn how to finish.
         refreshed_maps: frames per update whose stored grasp map and P[grasp] are computed anew by the current ensemble,
             the most outdated of the batch first; 0 for the whole batch.
     """
@@ -127,7 +127,7 @@ class ReLMMConfig(ControllerConfig):
     clip_targets: bool = True
     conservative_weight: float = 0.5
     mirror: bool = True
-    short_sighted_share: float = 0.5
+    tidied_share: float = 0.5
     refreshed_maps: int = 6
 
     def __post_init__(self) -> None:
@@ -206,7 +206,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "initial_temperature": (_TINY, math.inf),
     "pseudo_reset_share": (0, 0.9),
     "conservative_weight": (0, math.inf),
-    "short_sighted_share": (0, 1),
+    "tidied_share": (0, 1),
     "refreshed_maps": (0, math.inf),
 }
 

@@ -22,7 +22,6 @@ from relmm.policies.relmm.trail import TRAIL_FEATURES
 _CELLS = 7
 _ROWS, _COLUMNS = 30, 31
 _NEAR_ROWS = 1  # pixels of the map before the grasp area
-SIGHT = 2.4  # m, that the map reaches
 NOTICED = 64  # of 255, graspability from which on something is in view
 _HEADS = 8
 _INITIAL_ATTENTION = 6.0  # score of a certain grasp; -6 for a hopeless one
@@ -30,10 +29,10 @@ _POINT_FEATURES = 256
 _CONVOLUTION_FEATURES = 128
 
 
-def _places() -> Tensor:
-    """Where the map's pixels are: forward and left of the grasp area's middle, m, (2, 30, 31)."""
+def map_places() -> Tensor:
+    """Where the map's pixels are in the robot's frame: forward and left, m, (2, 30, 31)."""
     forward, left = (_CELLS * (high - low) / GRID for low, high in (GRASP_X, GRASP_Y))  # m, a pixel
-    rows = (torch.arange(_ROWS) - _NEAR_ROWS + 0.5 - GRID / 2 / _CELLS) * forward
+    rows = GRASP_X[0] + (torch.arange(_ROWS) - _NEAR_ROWS + 0.5) * forward
     columns = (torch.arange(_COLUMNS) - _COLUMNS // 2) * left
     return torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
 
@@ -111,16 +110,6 @@ class FloorObserver(nn.Module):
         return functional.softplus(logits).flatten(1).mean(dim=1).sum()
 
 
-def hide_beyond(maps: Tensor, reach: Tensor) -> Tensor:
-    """Maps, uint8 (batch, 4, 30, 31), with nothing to grasp further away than `reach` (m, (batch,)).
-
-    Their colours stay: averaged over a pixel, small things hardly show in them.
-    """
-    distances = _places().norm(dim=0).to(maps.device)
-    graspable = maps[:, :1] * (distances <= reach[:, None, None, None])
-    return torch.cat([graspable, maps[:, 1:]], dim=1)
-
-
 def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
     """What turns pictures into the observations of `config.navigation_encoder`."""
     return FloorObserver(config) if config.navigation_encoder == "floor" else PictureObserver()
@@ -138,7 +127,8 @@ class Keypoints(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.places: Tensor
-        self.register_buffer("places", _places().flatten(1), persistent=False)
+        middle = torch.tensor([[sum(GRASP_X) / 2], [sum(GRASP_Y) / 2]])
+        self.register_buffer("places", map_places().flatten(1) - middle, persistent=False)
         self.look = nn.Conv2d(FloorObserver.shape[0], _HEADS, 1, bias=False)
         with torch.no_grad():
             self.look.weight.mul_(0.1)

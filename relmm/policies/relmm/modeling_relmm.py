@@ -134,7 +134,7 @@ class ReLMMPolicy(ControllerPolicy):
             grasp_loss, logs = self.grasp_loss(*_attempts(batch, attempts), others, self.rng, offline=True)
             losses.append(grasp_loss)
         if steps.any():
-            navigation_batch = self._navigation_batch(batch, steps, trails[:, steps])
+            navigation_batch = self.augmented(self._navigation_batch(batch, steps, trails[:, steps]), self.rng)
             noise = torch.randn(2, int(steps.sum()), ACTIONS, device=batch["action"].device)
             conservatism = self.config.conservative_weight
             navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise, conservatism)
@@ -199,6 +199,13 @@ class ReLMMPolicy(ControllerPolicy):
         chance = torch.where(known, 0.0, probabilities)
         continues = batch.continues * (1 - chance) if self.config.relabel_terminal else batch.continues
         return replace(batch, rewards=batch.rewards + chance, continues=continues)
+
+    def augmented(self, batch: NavigationBatch, rng: torch.Generator) -> NavigationBatch:
+        """Navigation steps as they might have been as well: see `mirror` and `tidied_share`."""
+        if self.config.mirror and torch.rand(1, generator=rng) < 0.5:
+            batch = batch.mirrored()
+        tidied = self.config.tidied_share > 0 and self.config.navigation_encoder == "floor"
+        return batch.tidied(self.config.tidied_share, rng) if tidied else batch
 
     def _navigation_batch(self, batch: dict[str, Any], steps: Tensor, trails: Tensor) -> NavigationBatch:
         pictures, actions = batch[IMAGE_KEY][steps], batch["action"][steps]

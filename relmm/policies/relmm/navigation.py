@@ -11,11 +11,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
-from relmm.policies.relmm.encoders import NOTICED, SIGHT, Encoder, hide_beyond
+from relmm.policies.relmm.encoders import NOTICED, Encoder
+from relmm.policies.relmm.tidying import tidy
 from relmm.policies.relmm.trail import MIRROR, last_sides
 
 ACTIONS = 2  # forward and turn, each -1..1
 _LOG_STD_RANGE = (-5.0, 2.0)
+_NOT_ALL = 0.8  # share of the steps with a tidied floor in which something is left
 _UNIFORM_ACTIONS = 10  # that conservative Q-learning compares the taken one with
 
 
@@ -51,20 +53,17 @@ class NavigationBatch:
             next_trails=self.next_trails * MIRROR.to(sign.device),
         )
 
-    def short_sighted(self, share: float, rng: torch.Generator) -> NavigationBatch:
-        """The same, but in a share of the steps nothing to grasp is seen beyond some distance; for maps of the floor.
+    def tidied(self, share: float, rng: torch.Generator) -> NavigationBatch:
+        """The same, but in a share of the steps part of what lay about is gone; for maps of the floor.
 
-        A room in which much lies about seldom shows what to do where nothing is in view, but a tidied one asks it.
+        How much, is uniform, as it is over the time in which a room is tidied; in a fifth of them it is everything.
         """
         count = len(self.rewards)
-        reach = torch.rand(count, generator=rng) * SIGHT
-        reach[torch.rand(count, generator=rng) >= share] = math.inf
-        reach = reach.to(self.rewards.device)
-        return replace(
-            self,
-            observations=hide_beyond(self.observations, reach),
-            next_observations=hide_beyond(self.next_observations, reach),
-        )
+        empty = torch.rand(count, generator=rng) / _NOT_ALL
+        empty[torch.rand(count, generator=rng) >= share] = 0.0
+        empty = empty.to(self.rewards.device)
+        before, after = tidy(self.observations, self.next_observations, self.next_trails, empty, rng)
+        return replace(self, observations=before, next_observations=after)
 
 
 class Actor(nn.Module):

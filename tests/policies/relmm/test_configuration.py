@@ -60,7 +60,7 @@ PAPER: dict[str, Any] = {
     "initial_temperature": 1.0,
     "clip_targets": False,
     "mirror": False,
-    "short_sighted_share": 0.0,
+    "tidied_share": 0.0,
     "refreshed_maps": 0,
 }
 SMALL = {"grasp_channels": 32, "grasp_batch_size": 64, "navigation_encoder": "paper_small", "navigation_batch_size": 64}

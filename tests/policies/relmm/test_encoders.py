@@ -8,7 +8,7 @@ from torch.nn import functional
 from relmm.features import GRASP_X, GRASP_Y, GRID
 from relmm.geometry import camera_geometry
 from relmm.policies.relmm.configuration_relmm import NAVIGATION_ENCODERS
-from relmm.policies.relmm.encoders import Encoder, FloorObserver, Keypoints, PictureObserver, hide_beyond, make_observer
+from relmm.policies.relmm.encoders import Encoder, FloorObserver, Keypoints, PictureObserver, make_observer
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.grasping import GraspEnsemble
 from relmm.policies.relmm.trail import TRAIL_FEATURES
@@ -71,18 +71,6 @@ def test_thing_beyond_reach_is_judged_where_it_lies(camera, x, y, make_config, s
     true_column = ((y - GRASP_Y[0]) / cell[1] - GRID / 2) / PIXEL + MIDDLE[1]
     assert rows.float().mean().item() == pytest.approx(true_row, abs=1.0)
     assert columns.float().mean().item() == pytest.approx(true_column, abs=1.0)
-
-
-def test_what_is_beyond_a_distance_is_hidden_and_keeps_its_colour() -> None:
-    maps = torch.full((3, *FloorObserver.shape), 200, dtype=torch.uint8)
-    hidden = hide_beyond(maps, torch.tensor([0.0, 0.8, 9.0]))
-    forward, left = ((high - low) / GRID * PIXEL for low, high in (GRASP_X, GRASP_Y))
-    rows, columns = torch.meshgrid(torch.arange(30) - MIDDLE[0], torch.arange(31.0) - MIDDLE[1], indexing="ij")
-    near = torch.hypot(forward * rows, left * columns) <= 0.8
-    assert not hidden[0, 0].any()
-    assert torch.equal(hidden[1, 0] == 200, near)
-    assert torch.equal(hidden[2], maps[2])
-    assert torch.equal(hidden[:, 1:], maps[:, 1:])
 
 
 def test_mirrored_floor_gives_a_mirrored_map(observer, ensemble, see_green, noise_pictures) -> None:

@@ -374,11 +374,13 @@ def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, succes
     ],
 )
 def test_forward_learns_a_drive_as_the_replay_knows_it(outcomes, after, success, green: ReLMMPolicy, draw) -> None:
-    episode = make_episode(draw, *outcomes)
+    episode, before = make_episode(draw, *outcomes), green.rng.get_state()
     torch.manual_seed(7)
     loss, logs = green.forward(as_batch(green, episode, [0]))
     torch.manual_seed(7)
-    batch, noise = expected_batch(green, episode, after, success), torch.randn(2, 1, 2)
+    green.rng.set_state(before)
+    batch = green.augmented(expected_batch(green, episode, after, success), green.rng)
+    noise = torch.randn(2, 1, 2)
     expected, wanted = green.navigation.loss(batch, noise, green.config.conservative_weight)
     assert loss.item() == pytest.approx(expected.item(), rel=1e-4)
     assert logs == pytest.approx(wanted, rel=1e-4)

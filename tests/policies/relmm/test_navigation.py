@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
-from relmm.policies.relmm.encoders import SIGHT, Encoder, FloorObserver, PictureObserver
+from relmm.policies.relmm.encoders import Encoder, FloorObserver, PictureObserver
 from relmm.policies.relmm.navigation import Actor, Navigation, NavigationBatch
 from relmm.policies.relmm.trail import TRAIL_FEATURES
 
@@ -374,24 +374,6 @@ def test_actor_learns_by_the_turns_that_are_made(make_navigation: MakeNavigation
     value = torch.minimum(first, second) - 0.1 * next_density
     targets = navigation.bellman_targets(batch, noise[1], torch.tensor(0.1, dtype=torch.double))
     assert torch.allclose(targets, batch.rewards + navigation.config.gamma * batch.continues * value)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("row", [3, 12, 26])
-def test_short_sight_hides_what_is_far_before_and_after_a_step(row: int, share: float) -> None:
-    count = 2000
-    maps = torch.full((count, *FloorObserver.shape), 100, dtype=torch.uint8)
-    numbers, trails = torch.zeros(count), torch.zeros(count, TRAIL_FEATURES)
-    batch = NavigationBatch(maps, trails, torch.zeros(count, 2), numbers, maps, trails, numbers)
-    seen = batch.short_sighted(share, torch.Generator().manual_seed(0))
-    hidden = seen.observations[:, 0, row, 15] == 0
-    distance = (row - 1 + 0.5 - 15 / 14) * 7 * 0.165 / 15  # m; the grasp area is 16.5 cm deep
-    assert hidden.float().mean().item() == pytest.approx(share * distance / SIGHT, abs=0.04)
-    assert torch.equal(seen.observations, seen.next_observations)
-    assert torch.equal(seen.observations[:, 1:], maps[:, 1:])
-    assert share > 0 or torch.equal(seen.observations, maps), "to the corners"
-    assert seen.actions is batch.actions
-    assert seen.trails is trails
 
 
 # --- Mirror --------------------------------------------------------------------------------------------------

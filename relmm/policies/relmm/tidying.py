@@ -1,0 +1,58 @@
+"""Maps of the floor as if part of what lies about had been tidied away already.
+
+The robot learns in a room that stays full, because it puts back what it has picked up. At the end of its work there are
+only a few things left, far apart: it has to know by then how to search, and that one far thing is worth driving to.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from relmm.features import GRASP_X
+from relmm.policies.relmm.encoders import FloorObserver, map_places
+
+_PATCH = 0.3  # m, side of the squares of floor that are empty or are not
+_PATCHES = 24  # more than the map reaches, in a row
+_KEPT = 0.3  # m from the grasp area's middle; what lies there before or after a step may have been its success
+
+
+def tidy(
+    maps: Tensor, next_maps: Tensor, next_trails: Tensor, empty: Tensor, rng: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """The maps before and after navigation steps, without what lay on a random part of the floor.
+
+    What is gone is gone from both. Colours stay: averaged over a pixel, small things hardly show in them.
+
+    Args:
+        maps: uint8, (batch, 4, 30, 31).
+        next_maps: those after the steps.
+        next_trails: after the steps, `Trail.features`, (batch, 21).
+        empty: share of the floor, (batch,).
+        rng: chooses the squares.
+
+    Returns:
+        Like `maps` and `next_maps`.
+    """
+    device, count = maps.device, len(maps)
+    here = torch.complex(*map_places()).flatten().to(device)  # forward + i * left in the robot's frame, m
+    forward, left, turn = next_trails[:, :3, None].unbind(1)
+    moved, turned = torch.complex(forward, left), torch.polar(torch.ones_like(turn), turn * math.pi)
+    emptied = torch.rand(count, _PATCHES**2, generator=rng).to(device) < empty[:, None]
+    corners = torch.rand(2, count, 1, generator=rng).to(device) + _PATCHES // 2
+
+    def without(each: Tensor, before: Tensor, after: Tensor) -> Tensor:
+        """A map without what lies on empty squares; where its pixels are, in the robot's frames before and after."""
+        near = torch.minimum(*((places - sum(GRASP_X) / 2).abs() for places in (before, after))) < _KEPT
+        rows, columns = (
+            (axis / _PATCH + corner).long().clamp(0, _PATCHES - 1)
+            for axis, corner in zip((before.real, before.imag), corners, strict=True)
+        )
+        gone = emptied.gather(1, rows * _PATCHES + columns) & ~near
+        graspable = each[:, :1] * ~gone.view(count, 1, *FloorObserver.shape[1:])
+        return torch.cat([graspable, each[:, 1:]], dim=1)
+
+    before = without(maps, here.expand(count, -1), here * turned + moved)
+    return before, without(next_maps, (here - moved) * turned.conj(), here.expand(count, -1))

@@ -1,0 +1,97 @@
+"""Maps of a tidier room: what is gone is gone before and after a step, and nothing else has changed."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from relmm.features import DRIVE_PULSE_S, GRASP_X, MAX_THETA_VEL
+from relmm.policies.relmm.encoders import FloorObserver, map_places
+from relmm.policies.relmm.navigation import NavigationBatch
+from relmm.policies.relmm.tidying import tidy
+from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
+
+COUNT = 400
+STEPS = [(0.0, 0.0), (0.44, 0.0), (0.0, MAX_THETA_VEL), (0.3, -80.0), (0.44, 60.0)]  # m/s and deg/s
+
+
+def maps(count: int = COUNT) -> Tensor:
+    return torch.full((count, *FloorObserver.shape), 200, dtype=torch.uint8)
+
+
+def trails(x_vel: float, theta_vel: float, count: int = COUNT) -> Tensor:
+    trail = Trail()
+    trail.moved(0.2, 30.0)
+    trail.moved(x_vel, theta_vel)
+    return torch.from_numpy(trail.features()).expand(count, -1)
+
+
+def pixel_of(forward: float, left: float) -> tuple[int, int] | None:
+    """The map's pixel of a place in the robot's frame, m, if the map reaches there."""
+    places = map_places()
+    distances = torch.hypot(places[0] - forward, places[1] - left)
+    row, column = divmod(int(distances.argmin()), places.shape[2])
+    return (row, column) if distances.min() < 0.04 else None
+
+
+@pytest.mark.parametrize(("x_vel", "theta_vel"), STEPS)
+def test_what_is_gone_before_a_step_is_gone_after_it(x_vel: float, theta_vel: float) -> None:
+    """Where the same place of the floor is, comes from how the robot moves: along an arc of 0.24 s."""
+    generator = torch.Generator().manual_seed(0)
+    before, after = tidy(maps(), maps(), trails(x_vel, theta_vel), torch.full((COUNT,), 0.5), generator)
+    turn, length = math.radians(theta_vel) * DRIVE_PULSE_S, x_vel * DRIVE_PULSE_S
+    robot = (length * math.cos(turn / 2), length * math.sin(turn / 2))
+    compared = differing = 0
+    for forward in (0.7, 1.0, 1.3, 1.6, 1.9):
+        for left in (-0.6, -0.3, 0.0, 0.3, 0.6):
+            x, y = forward - robot[0], left - robot[1]
+            there = pixel_of(math.cos(turn) * x + math.sin(turn) * y, math.cos(turn) * y - math.sin(turn) * x)
+            here = pixel_of(forward, left)
+            if there is not None and here is not None:
+                compared += COUNT
+                differing += int((before[:, 0, *here] != after[:, 0, *there]).sum())
+    assert compared > 5 * COUNT
+    assert differing / compared < 0.15, "but for places at the edge of a square; by chance it would be half"
+
+
+@pytest.mark.parametrize("empty", [0.0, 0.3, 1.0])
+def test_share_of_the_floor_is_emptied_and_colours_stay(empty: float) -> None:
+    generator = torch.Generator().manual_seed(1)
+    before, after = tidy(maps(), maps(), trails(0.2, 40.0), torch.full((COUNT,), empty), generator)
+    far = torch.hypot(map_places()[0] - sum(GRASP_X) / 2, map_places()[1]) > 0.6
+    for each in (before, after):
+        assert (each[:, 0, far] == 0).float().mean().item() == pytest.approx(empty, abs=0.03)
+        assert set(each[:, 0].unique().tolist()) <= {0, 200}
+        assert torch.equal(each[:, 1:], maps()[:, 1:])
+
+
+@pytest.mark.parametrize(("x_vel", "theta_vel"), STEPS)
+def test_what_may_have_been_grasped_stays(x_vel: float, theta_vel: float) -> None:
+    """What lies in the grasp area after the step was somewhere before it, and is there, too."""
+    generator = torch.Generator().manual_seed(2)
+    before, after = tidy(maps(), maps(), trails(x_vel, theta_vel), torch.ones(COUNT), generator)
+    turn, length = math.radians(theta_vel) * DRIVE_PULSE_S, x_vel * DRIVE_PULSE_S
+    x, y = length * math.cos(turn / 2), length * math.sin(turn / 2)
+    for forward in GRASP_X:
+        then = pixel_of(x + math.cos(turn) * forward, y + math.sin(turn) * forward)
+        now = pixel_of(forward, 0.0)
+        assert then is not None
+        assert now is not None
+        assert (before[:, 0, *then] == 200).all()
+        assert (after[:, 0, *now] == 200).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_share_of_the_steps_is_tidied(share: float) -> None:
+    numbers = torch.zeros(COUNT)
+    batch = NavigationBatch(maps(), trails(0, 0), torch.zeros(COUNT, 2), numbers, maps(), trails(0.1, 0.0), numbers)
+    tidied = batch.tidied(share, torch.Generator().manual_seed(3))
+    touched = (tidied.observations[:, 0] == 0).flatten(1).any(dim=1)
+    assert touched.float().mean().item() == pytest.approx(share, abs=0.08)
+    far = map_places()[0] > 1.0
+    bare = (tidied.observations[:, 0, far] == 0).all(dim=1)
+    assert bare.float().mean().item() == pytest.approx(share / 5, abs=0.06), "everything far is gone"
+    assert tidied.rewards is batch.rewards
+    assert tidied.actions is batch.actions
+    assert tidied.next_trails.shape == (COUNT, TRAIL_FEATURES)
