@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
+from collections import ChainMap
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,18 +13,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.features import ACTION_NAMES, IMAGE_KEY, MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict, xy_to_cell
+from relmm.features import IMAGE_KEY
 from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import FloorObserver, make_observer
 from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm.maps import Maps
-from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch
-from relmm.policies.relmm.trail import HISTORY, TRAIL_FEATURES, Trail
-
-_REMEMBERED_FRAMES = 2**17  # 4 kB each, as they are met
-_SKILL = ACTION_NAMES.index("skill.pos")
-_PLACE = slice(ACTION_NAMES.index("skill_x.pos"), ACTION_NAMES.index("skill_y.pos") + 1)
+from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch, to_navigation_step
+from relmm.policies.relmm.offline import CAPACITY, Batch, Recollection, Rows
+from relmm.policies.relmm.trail import Trail
 
 
 class ReLMMPolicy(ControllerPolicy):
@@ -49,7 +48,8 @@ class ReLMMPolicy(ControllerPolicy):
         self.rng = torch.Generator().manual_seed(config.seed or 0)
         self.sampling = config.sample
         self.estimate: Estimate | None = None
-        self._maps: Maps | None = None  # of the frames that `forward` has seen
+        # Of the frames that `forward` has seen.
+        self._maps, self._recollection = Maps(self.observer, self.grasping, CAPACITY), Recollection()
 
     # --- Acting -------------------------------------------------------------------------------------------
     def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
@@ -123,19 +123,22 @@ class ReLMMPolicy(ControllerPolicy):
                 (batch, time), where time is `config.observation_delta_indices`; which of them are padding.
             **kwargs: LeRobot's, not used.
         """
-        trails = _trails(batch)
-        batch = {**batch, "action": batch["action"][:, HISTORY:]}
-        skills = batch["action"][:, 0, _SKILL].round().long()
-        attempts, steps = skills == Skill.GRASP, _drives(batch, skills)
+        shown, memory = Batch(batch), self._recollection
+        attempts, steps, pictures = shown.attempts, shown.steps, ChainMap(shown.pictures, memory.pictures)
+        if self.training:
+            memory.add(shown)
+            attempts = memory.top_up(attempts, self.config.grasp_batch_size, self.rng)
+            steps = memory.top_up(steps, self.config.navigation_batch_size, self.rng)
         losses = [self._no_loss()]
         logs: dict[str, Any] = {}
-        if attempts.any():
-            others = batch[IMAGE_KEY][:, 0]
-            grasp_loss, logs = self.grasp_loss(*_attempts(batch, attempts), others, self.rng, offline=True)
+        if len(attempts) > 0:
+            cells, successes = (self._on_device(attempts[name]) for name in ("cell", "success"))
+            seen, others = self._pictures_of(attempts["frame"], pictures), batch[IMAGE_KEY][:, 0]
+            grasp_loss, logs = self.grasp_loss(seen, cells, successes, others, self.rng, offline=True)
             losses.append(grasp_loss)
-        if steps.any():
-            navigation_batch = self.augmented(self._navigation_batch(batch, steps, trails[:, steps]), self.rng)
-            noise = torch.randn(2, int(steps.sum()), ACTIONS, device=batch["action"].device)
+        if len(steps) > 0:
+            navigation_batch = self.augmented(self._navigation_batch(steps, pictures), self.rng)
+            noise = torch.randn(2, len(steps), ACTIONS, device=self.weights_device)
             conservatism = self.config.conservative_weight
             navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise, conservatism)
             losses.append(navigation_loss)
@@ -171,8 +174,7 @@ class ReLMMPolicy(ControllerPolicy):
     def update(self) -> None:
         """Called after each step of the optimiser."""
         self.navigation.update_targets()
-        if self._maps is not None:
-            self._maps.version += 1
+        self._maps.version += 1
 
     def get_optim_params(self) -> Any:
         """One group for the ensemble and one for the navigation, with their learning rates."""
@@ -207,106 +209,30 @@ class ReLMMPolicy(ControllerPolicy):
         tidied = self.config.tidied_share > 0 and self.config.navigation_encoder == "floor"
         return batch.tidied(self.config.tidied_share, rng) if tidied else batch
 
-    def _navigation_batch(self, batch: dict[str, Any], steps: Tensor, trails: Tensor) -> NavigationBatch:
-        pictures, actions = batch[IMAGE_KEY][steps], batch["action"][steps]
-        attempted = actions[:, 1:, _SKILL].round() == Skill.GRASP
-        # Only attempts that follow the step without another step between them are its outcome.
-        own = attempted.long().cumprod(dim=1).bool()
-        success = (own & (batch["next.reward"][steps][:, 1:] > 0.5)).any(dim=1)
-        after = (own.sum(dim=1) + 1).clamp(max=pictures.shape[1] - 1)
-        # At the episode's end there is no step after the attempts: the picture before them is what the drive led to.
-        after = torch.where(_padded(batch, steps).gather(1, after[:, None]).squeeze(1), 1, after)
-        rows = torch.arange(len(pictures), device=pictures.device)
-        seen = torch.cat([pictures[:, 0], pictures[rows, after]])
-        numbers = None if "index" not in batch else torch.cat([batch["index"][steps], batch["index"][steps] + after])
-        observations, probabilities = self._see(seen, numbers)
-        count = len(pictures)
-        result = NavigationBatch(
+    def _navigation_batch(self, steps: Rows, pictures: Mapping[int, Tensor]) -> NavigationBatch:
+        """Steps of `offline.STEP` with what the ensemble makes of their pictures, relabelled."""
+        frames = np.concatenate([steps["frame"], steps["next"]])
+        find = partial(self._pictures_of, pictures=pictures)
+        observations, probabilities = map(self._on_device, self._maps.get(frames, find, self.config.refreshed_maps))
+        success, attempted = (self._on_device(steps[name]) for name in ("success", "attempted"))
+        trails, count = self._on_device(steps["trails"]), len(steps)
+        batch = NavigationBatch(
             observations[:count],
-            trails[0],
-            from_navigation_steps(actions[:, 0]),
+            trails[:, 0],
+            self._on_device(steps["action"]),
             success.float() - 1,
             observations[count:],
-            trails[1],
+            trails[:, 1],
             1 - success.float(),
         )
-        return self.relabel(result, probabilities[count:], success, own.any(dim=1))
+        return self.relabel(batch, probabilities[count:], success, attempted)
 
-    def _see(self, pictures: Tensor, numbers: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Observations and P[grasp] of pictures; of those with numbers, what earlier batches found out is kept."""
-        if numbers is None:
-            estimate = self.grasping.estimate(pictures)
-            return self.observer(pictures, self.grasping), self.grasping.grasp_probability(estimate)
-        if self._maps is None:
-            self._maps = Maps(self.observer, self.grasping, _REMEMBERED_FRAMES)
-        # Another dataset may have another picture of the same number.
-        checksums = (pictures * 255).double().round().flatten(1).sum(dim=1).long()
-        frames = (numbers + checksums * _REMEMBERED_FRAMES).cpu().numpy()
-        rows = {frame: row for row, frame in enumerate(frames.tolist())}
+    def _pictures_of(self, frames: NDArray[np.int64], pictures: Mapping[int, Tensor]) -> Tensor:
+        """As the networks take them: 0..1, (n, 3, 100, 100)."""
+        return self._on_device(torch.stack([pictures[frame] for frame in frames.tolist()])) / 255
 
-        def find(wanted: NDArray[np.int64]) -> Tensor:
-            return pictures[[rows[frame] for frame in wanted.tolist()]]
-
-        observations, probabilities = self._maps.get(frames, find, self.config.refreshed_maps)
-        return observations.to(pictures.device), probabilities.to(pictures.device)
+    def _on_device(self, values: Tensor | NDArray[Any]) -> Tensor:
+        return torch.as_tensor(values).to(self.weights_device)
 
     def _no_loss(self) -> Tensor:
         return self.navigation.log_temperature * 0.0
-
-
-def to_navigation_step(action: list[float]) -> dict[str, float]:
-    """A navigation step for forward and turn in -1..1; -1 forward stands still, as in the authors' code."""
-    return action_dict(x_vel=(action[0] + 1) / 2 * MAX_X_VEL, theta_vel=action[1] * MAX_THETA_VEL)
-
-
-def from_navigation_steps(actions: Tensor) -> Tensor:
-    """Forward and turn in -1..1, (batch, 2), of actions as datasets hold them, (batch, 5)."""
-    return torch.stack([actions[:, 0] / MAX_X_VEL * 2 - 1, actions[:, 1] / MAX_THETA_VEL], dim=1).clamp(-1, 1)
-
-
-def _drives(batch: dict[str, Any], skills: Tensor) -> Tensor:
-    """Which frames are navigation steps whose outcome is in the batch, (batch,) bool.
-
-    Not there are the picture after an episode's last frame, and what came of a curriculum's many attempts.
-    """
-    drives = skills == Skill.NAVIGATE
-    padded = _padded(batch, drives.new_ones(len(drives)))
-    failed = (batch["action"][..., _SKILL].round() == Skill.GRASP) & (batch["next.reward"] < 0.5) & ~padded
-    return drives & ~padded[:, 1] & ~failed[:, 1:].all(dim=1)
-
-
-def _trails(batch: dict[str, Any]) -> Tensor:
-    """Where the robot had been before each frame, and if it drives, after it, (2, batch, 21).
-
-    From the actions of the frames before; the turns of collision avoidance, which only the odometry has, are missing.
-    """
-    actions: Tensor = batch["action"]
-    unknown: Tensor = batch.get("action_is_pad", torch.zeros(actions.shape[:2], dtype=torch.bool))
-    features = np.empty((2, len(actions), TRAIL_FEATURES), np.float32)
-    for row, (steps, padded) in enumerate(zip(actions.tolist(), unknown.tolist(), strict=True)):
-        trail = Trail()
-        for x_vel, theta_vel, skill, *_ in itertools.compress(steps[:HISTORY], np.logical_not(padded)):
-            if round(skill) == Skill.PLACE:
-                trail.reset()
-            elif round(skill) == Skill.NAVIGATE:
-                trail.moved(x_vel, theta_vel)
-        features[0, row] = trail.features()
-        trail.moved(*steps[HISTORY][:2])
-        features[1, row] = trail.features()
-    return torch.from_numpy(features).to(actions.device)
-
-
-def _padded(batch: dict[str, Any], rows: Tensor) -> Tensor:
-    """Which frames lie beyond their episode's end, (rows, time) bool."""
-    padded: Tensor | None = batch.get(f"{IMAGE_KEY}_is_pad")
-    return (
-        torch.zeros(batch["action"].shape[:2], dtype=torch.bool, device=rows.device)[rows]
-        if padded is None
-        else padded[rows]
-    )
-
-
-def _attempts(batch: dict[str, Any], attempts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    places = batch["action"][attempts][:, 0, _PLACE].tolist()
-    cells = torch.tensor([xy_to_cell(x, y) for x, y in places], device=attempts.device)
-    return batch[IMAGE_KEY][attempts][:, 0], cells, (batch["next.reward"][attempts][:, 0] > 0.5).float()

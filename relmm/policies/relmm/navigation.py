@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import NOTICED, Encoder
 from relmm.policies.relmm.tidying import tidy
@@ -256,3 +257,13 @@ def _dense_layers(config: ReLMMConfig, inputs: int, outputs: int) -> nn.Sequenti
     normalise = [nn.LayerNorm(hidden)] if config.navigation_encoder == "floor" else []
     first = [nn.Linear(inputs, hidden), *normalise, nn.ReLU()]
     return nn.Sequential(*first, nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+
+
+def to_navigation_step(action: list[float]) -> dict[str, float]:
+    """A navigation step for forward and turn in -1..1; -1 forward stands still, as in the authors' code."""
+    return action_dict(x_vel=(action[0] + 1) / 2 * MAX_X_VEL, theta_vel=action[1] * MAX_THETA_VEL)
+
+
+def from_navigation_steps(actions: Tensor) -> Tensor:
+    """Forward and turn in -1..1, (batch, 2), of actions as datasets hold them, (batch, 5)."""
+    return torch.stack([actions[:, 0] / MAX_X_VEL * 2 - 1, actions[:, 1] / MAX_THETA_VEL], dim=1).clamp(-1, 1)

@@ -28,8 +28,8 @@ from relmm.features import (
     xy_to_cell,
 )
 from relmm.policies.controller import grasp_cell
-from relmm.policies.relmm.modeling_relmm import ReLMMPolicy, from_navigation_steps, to_navigation_step
-from relmm.policies.relmm.navigation import NavigationBatch
+from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.policies.relmm.navigation import NavigationBatch, from_navigation_steps, to_navigation_step
 from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
 from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
 
@@ -57,10 +57,14 @@ def certain(make_policy_of: MakePolicy, set_logits) -> MakePolicy:
     return make
 
 
+# Batches of LeRobot's are large enough, and are not topped up with what earlier ones have shown.
+NO_RECOLLECTION = {"grasp_batch_size": 1, "navigation_batch_size": 1}
+
+
 @pytest.fixture
 def green(make_policy_of: MakePolicy, see_green) -> ReLMMPolicy:
     """A policy that wants to grasp what is green."""
-    policy = make_policy_of(seed=3)
+    policy = make_policy_of(seed=3, **NO_RECOLLECTION)
     see_green(policy.grasping, [15.0, 20.0, 25.0])
     return policy
 
@@ -408,7 +412,7 @@ def test_forward_learns_attempts_with_the_loss_of_the_ensemble(green: ReLMMPolic
 
 
 def test_forward_adds_both_losses_and_update_moves_the_targets(make_policy_of: MakePolicy, draw) -> None:
-    policy = make_policy_of(seed=1, background_weight=0.0, conservative_weight=0.0)
+    policy = make_policy_of(seed=1, background_weight=0.0, conservative_weight=0.0, **NO_RECOLLECTION)
     episode = make_episode(draw, *"dfdfs")
     batch = as_batch(policy, episode, range(5))
     loss, logs = policy.forward(batch)
@@ -436,3 +440,26 @@ def test_forward_remembers_maps_by_number_but_not_those_of_another_dataset(green
     assert losses[0] == pytest.approx(losses[1]) == pytest.approx(losses[2])
     assert losses[3] == pytest.approx(losses[4]) == pytest.approx(losses[5])
     assert losses[0] != pytest.approx(losses[3])
+
+
+@pytest.mark.parametrize(("training", "steps", "attempts"), [(True, [4, 4], [3, 3]), (False, [1, 2], [1, 1])])
+def test_forward_tops_up_small_batches_with_what_earlier_ones_showed(
+    training, steps, attempts, make_policy_of: MakePolicy, draw, monkeypatch
+) -> None:
+    """Loading is slow; to learn twice from what was loaded is not. What is new is always there."""
+    policy = make_policy_of(grasp_batch_size=3, navigation_batch_size=4, mirror=False, tidied_share=0.0)
+    policy.train(training)
+    episode, seen = make_episode(draw, *"dfdds"), []
+    losses = {"navigation": policy.navigation.loss, "grasping": policy.grasping.loss}
+    for module, loss in losses.items():
+        monkeypatch.setattr(getattr(policy, module), "loss", lambda *a, loss=loss: seen.append(a[0]) or loss(*a))
+    for frames in ([0, 1], [2, 3, 4]):
+        policy.forward({**as_batch(policy, episode, frames), "index": torch.tensor(frames)})
+    pictures, batches = seen[0::2], seen[1::2]
+    assert [len(each) for each in pictures] == attempts
+    assert [len(each.rewards) for each in batches] == steps
+    assert torch.equal(pictures[1][0], policy.to_pictures(episode[4][0])[0])
+    first, second = (policy.observer(policy.to_pictures(episode[frame][0]), policy.grasping)[0] for frame in (0, 2))
+    assert torch.equal(batches[1].observations[0], second)
+    assert all(torch.equal(each, first) for each in batches[0].observations)
+    assert not training or any(torch.equal(each, first) for each in batches[1].observations[2:])
