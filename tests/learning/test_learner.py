@@ -281,7 +281,7 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
     alone = {"background_weight": 0.0, "conservative_weight": 0.0, "mirror": False, "tidied_share": 0.0}
     policy = make_policy(refreshed_maps=0, **alone, seed=2)
     deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
-    columns = dict.fromkeys((IMAGE_KEY, "next.reward"), deltas)
+    columns = {IMAGE_KEY: deltas}
     columns["action"] = [delta / FPS for delta in policy.config.action_delta_indices]
     frames = list(LeRobotDataset("local/diverse", root=RECORDED, delta_timestamps=columns, episodes=[0, 1, 2]))
     learner, episode = Learner(policy, Replay(len(frames)), seed=0), 0
@@ -290,7 +290,7 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
             learner.replay.save_episode()
         episode = frame["episode_index"]
         picture = (frame[IMAGE_KEY][0] * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
-        success = bool(frame["next.reward"][0] > 0)
+        success = bool(frame["next.reward"] > 0)
         motion, action = frame["action"][HISTORY - 1, :2].tolist(), frame["action"][HISTORY]
         learner.replay.add(picture, motion, action, success, Phase.LEARNING)
     learner.replay.save_episode()

@@ -157,11 +157,6 @@ class ReLMMConfig(ControllerConfig):
         """As the observations, and those before, which tell where the robot has just been."""
         return [*range(-HISTORY, 0), *self.observation_delta_indices]
 
-    @property
-    def reward_delta_indices(self) -> list[int]:
-        """As the observations."""
-        return self.observation_delta_indices
-
     def get_optimizer_preset(self) -> AdamConfig:
         """For `lerobot-train`, which has one optimiser; the learning rates are in the policy's parameter groups."""
         return AdamConfig(lr=self.navigation_learning_rate, weight_decay=0.0, grad_clip_norm=math.inf)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -120,24 +118,29 @@ class ReLMMPolicy(ControllerPolicy):
 
         Args:
             batch: pictures (batch, time, 3, 100, 100) 0..1, `action` (batch, history + time, 5) and `next.reward`
-                (batch, time), where time is `config.observation_delta_indices`; which of them are padding.
+                (batch,), where time is `config.observation_delta_indices`; which of them are padding.
             **kwargs: LeRobot's, not used.
         """
-        shown, memory = Batch(batch), self._recollection
-        attempts, steps, pictures = shown.attempts, shown.steps, ChainMap(shown.pictures, memory.pictures)
+        memory = self._recollection if self.training else Recollection()
+        attempts, steps = memory.add(Batch(batch))
         if self.training:
-            memory.add(shown)
             attempts = memory.top_up(attempts, self.config.grasp_batch_size, self.rng)
             steps = memory.top_up(steps, self.config.navigation_batch_size, self.rng)
+
+        def find(frames: NDArray[np.int64]) -> Tensor:
+            return self._on_device(memory.pictures_of(frames)) / 255
+
         losses = [self._no_loss()]
         logs: dict[str, Any] = {}
         if len(attempts) > 0:
             cells, successes = (self._on_device(attempts[name]) for name in ("cell", "success"))
-            seen, others = self._pictures_of(attempts["frame"], pictures), batch[IMAGE_KEY][:, 0]
-            grasp_loss, logs = self.grasp_loss(seen, cells, successes, others, self.rng, offline=True)
+            others = batch[IMAGE_KEY][:, 0]
+            grasp_loss, logs = self.grasp_loss(
+                find(attempts["frame"]), cells, successes, others, self.rng, offline=True
+            )
             losses.append(grasp_loss)
         if len(steps) > 0:
-            navigation_batch = self.augmented(self._navigation_batch(steps, pictures), self.rng)
+            navigation_batch = self.augmented(self._navigation_batch(steps, find), self.rng)
             noise = torch.randn(2, len(steps), ACTIONS, device=self.weights_device)
             conservatism = self.config.conservative_weight
             navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise, conservatism)
@@ -209,10 +212,9 @@ class ReLMMPolicy(ControllerPolicy):
         tidied = self.config.tidied_share > 0 and self.config.navigation_encoder == "floor"
         return batch.tidied(self.config.tidied_share, rng) if tidied else batch
 
-    def _navigation_batch(self, steps: Rows, pictures: Mapping[int, Tensor]) -> NavigationBatch:
+    def _navigation_batch(self, steps: Rows, find: Callable[[NDArray[np.int64]], Tensor]) -> NavigationBatch:
         """Steps of `offline.STEP` with what the ensemble makes of their pictures, relabelled."""
         frames = np.concatenate([steps["frame"], steps["next"]])
-        find = partial(self._pictures_of, pictures=pictures)
         observations, probabilities = map(self._on_device, self._maps.get(frames, find, self.config.refreshed_maps))
         success, attempted = (self._on_device(steps[name]) for name in ("success", "attempted"))
         trails, count = self._on_device(steps["trails"]), len(steps)
@@ -226,10 +228,6 @@ class ReLMMPolicy(ControllerPolicy):
             1 - success.float(),
         )
         return self.relabel(batch, probabilities[count:], success, attempted)
-
-    def _pictures_of(self, frames: NDArray[np.int64], pictures: Mapping[int, Tensor]) -> Tensor:
-        """As the networks take them: 0..1, (n, 3, 100, 100)."""
-        return self._on_device(torch.stack([pictures[frame] for frame in frames.tolist()])) / 255
 
     def _on_device(self, values: Tensor | NDArray[Any]) -> Tensor:
         return torch.as_tensor(values).to(self.weights_device)

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, Skill, xy_to_cell
 from relmm.policies.relmm.navigation import from_navigation_steps
 from relmm.policies.relmm.trail import HISTORY, TRAIL_FEATURES, Trail
@@ -42,31 +43,36 @@ class Batch:
 
     Attributes:
         attempts: rows of `ATTEMPT`.
-        steps: rows of `STEP`: the drives whose outcome is in the batch.
+        steps: rows of `STEP`; whether they led to a success, other frames tell.
+        tries: by step, the frames of the attempts that followed it.
         pictures: by frame, uint8 (3, 100, 100). A frame's number is also made of its picture, because another dataset
             may have another one of the same number.
+
+    Raises:
+        ConfigError: the dataset has no rewards.
     """
 
     def __init__(self, batch: dict[str, Any]) -> None:
+        if "next.reward" not in batch:
+            raise ConfigError("The dataset has no column next.reward: train relmm from one of relmm-record or -train.")
         pictures = (batch[IMAGE_KEY] * 255).round().to(torch.uint8)  # (batch, time, 3, 100, 100)
         actions, padded = batch["action"][:, HISTORY:].cpu(), _padding(batch, IMAGE_KEY, pictures)
         self._frames = _frames(batch, pictures)
-        skills = actions[..., _SKILL].round().numpy()
-        rewards = batch["next.reward"].cpu().numpy() > 0.5
-        self._chosen: dict[int, tuple[int, int]] = {}
+        self._places: dict[int, tuple[int, int]] = {}
+        grasps, drives = (actions[..., _SKILL].round().numpy() == skill for skill in (Skill.GRASP, Skill.NAVIGATE))
 
-        attempts = np.flatnonzero(skills[:, 0] == Skill.GRASP)
+        attempts = np.flatnonzero(grasps[:, 0])
         self.attempts: Rows = np.zeros(len(attempts), ATTEMPT)
         self.attempts["frame"] = self._use(attempts, np.zeros_like(attempts))
         self.attempts["cell"] = [xy_to_cell(x, y) for x, y in actions[attempts, 0, _PLACE].tolist()]
-        self.attempts["success"] = rewards[attempts, 0]
+        self.attempts["success"] = batch["next.reward"].reshape(-1).cpu().numpy()[attempts] > 0.5
 
-        # Not there are the picture after an episode's last frame, and what came of a curriculum's many attempts.
-        failed = (skills == Skill.GRASP) & ~rewards & ~padded
-        steps = np.flatnonzero((skills[:, 0] == Skill.NAVIGATE) & ~padded[:, 1] & ~failed[:, 1:].all(axis=1))
         # Only attempts that follow the step without another step between them are its outcome.
-        own = np.logical_and.accumulate(skills[steps, 1:] == Skill.GRASP, axis=1)
-        after = np.minimum(own.sum(axis=1) + 1, skills.shape[1] - 1)
+        own = np.logical_and.accumulate(grasps[:, 1:] & ~padded[:, 1:], axis=1)
+        # Not there are the picture after an episode's last frame, and what came of a curriculum's many attempts.
+        steps = np.flatnonzero(drives[:, 0] & ~padded[:, 1] & ~own.all(axis=1))
+        after = own[steps].sum(axis=1) + 1
+        self.tries = [self._frames[row, 1:end].tolist() for row, end in zip(steps, after, strict=True)]
         # At the episode's end there is no step after the attempts: the picture before them is what the drive led to.
         after = np.where(padded[steps, after], 1, after)
         self.steps: Rows = np.zeros(len(steps), STEP)
@@ -74,34 +80,51 @@ class Batch:
         self.steps["next"] = self._use(steps, after)
         self.steps["action"] = from_navigation_steps(actions[steps, 0]).numpy()
         self.steps["trails"] = _trails(batch, steps)
-        self.steps["success"] = (own & rewards[steps, 1:]).any(axis=1)
-        self.steps["attempted"] = own.any(axis=1)
-        self.pictures = {frame: pictures[row, time].cpu() for frame, (row, time) in self._chosen.items()}
+        self.steps["attempted"] = own[steps, 0]
+        self.pictures = {frame: pictures[row, time].cpu() for frame, (row, time) in self._places.items()}
 
     def _use(self, rows: NDArray[np.intp], times: NDArray[np.intp]) -> NDArray[np.int64]:
         """The frames of some rows at some times, whose pictures will be needed."""
         frames = self._frames[rows, times]
-        self._chosen |= zip(frames.tolist(), zip(rows.tolist(), times.tolist(), strict=True), strict=True)
+        self._places |= zip(frames.tolist(), zip(rows.tolist(), times.tolist(), strict=True), strict=True)
         return frames
 
 
 class Recollection:
-    """Attempts and navigation steps of earlier batches.
+    """Attempts and navigation steps of LeRobot's batches, which come in any order.
 
     LeRobot takes longer to load a frame, with the frames before and after it, than the policy takes to learn from it.
-    So each is learned from more than once. LeRobot shuffles, so that what fits in is as good as any.
+    So each is learned from more than once. When there are too many, it begins anew.
     """
 
     def __init__(self) -> None:
-        self.pictures: dict[int, Tensor] = {}
-        self._known: dict[np.dtype[np.void], dict[int, np.void]] = {ATTEMPT: {}, STEP: {}}
+        self._pictures: dict[int, Tensor] = {}
+        self._successes: dict[int, bool] = {}  # by frame of the attempt
+        self._waiting: list[tuple[np.void, list[int]]] = []  # steps for attempts that no batch has shown yet
+        self._known: dict[np.dtype[np.void], dict[int, np.void]] = {ATTEMPT: {}, STEP: {}}  # by frame
 
-    def add(self, batch: Batch) -> None:
-        """Remember a batch, if there is room."""
-        if len(self.pictures) < CAPACITY:
-            self.pictures |= batch.pictures
-            for rows in (batch.attempts, batch.steps):
-                self._known[rows.dtype] |= zip(rows["frame"].tolist(), rows, strict=True)
+    def add(self, batch: Batch) -> tuple[Rows, Rows]:
+        """Take in a batch.
+
+        Returns:
+            Attempts that are new, and steps whose outcome is newly known.
+        """
+        if len(self._pictures) > CAPACITY:
+            self.__init__()  # type: ignore[misc]
+        self._pictures |= batch.pictures
+        self._successes |= zip(batch.attempts["frame"].tolist(), batch.attempts["success"] > 0.5, strict=True)
+        found, waiting = [], self._waiting + list(zip(batch.steps, batch.tries, strict=True))
+        self._waiting = []
+        for step, tries in waiting:
+            if all(frame in self._successes for frame in tries):
+                step["success"] = any(self._successes[frame] for frame in tries)
+                found.append(step)
+            else:
+                self._waiting.append((step, tries))
+        steps = np.array(found, STEP)
+        for rows in (batch.attempts, steps):
+            self._known[rows.dtype] |= zip(rows["frame"].tolist(), rows, strict=True)
+        return batch.attempts, steps
 
     def top_up(self, rows: Rows, size: int, rng: torch.Generator) -> Rows:
         """Rows, and remembered ones of their kind until there are `size`, if there are any."""
@@ -110,6 +133,10 @@ class Recollection:
             return rows
         chosen = torch.randint(len(known), (wanted,), generator=rng).tolist()
         return np.concatenate([rows, np.array([known[index] for index in chosen], rows.dtype)])
+
+    def pictures_of(self, frames: NDArray[np.int64]) -> Tensor:
+        """Uint8, (n, 3, 100, 100)."""
+        return torch.stack([self._pictures[frame] for frame in frames.tolist()])
 
 
 def _frames(batch: dict[str, Any], pictures: Tensor) -> NDArray[np.int64]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import relmm.plugin  # noqa: F401
+from relmm.errors import ConfigError
 from relmm.features import (
     ACTION_NAMES,
     BASKET_XY,
@@ -57,14 +58,14 @@ def certain(make_policy_of: MakePolicy, set_logits) -> MakePolicy:
     return make
 
 
-# Batches of LeRobot's are large enough, and are not topped up with what earlier ones have shown.
-NO_RECOLLECTION = {"grasp_batch_size": 1, "navigation_batch_size": 1}
+# Batches of LeRobot's are large enough, and are learned from as they are.
+PLAIN = {"grasp_batch_size": 1, "navigation_batch_size": 1, "mirror": False, "tidied_share": 0.0}
 
 
 @pytest.fixture
 def green(make_policy_of: MakePolicy, see_green) -> ReLMMPolicy:
     """A policy that wants to grasp what is green."""
-    policy = make_policy_of(seed=3, **NO_RECOLLECTION)
+    policy = make_policy_of(seed=3, **PLAIN)
     see_green(policy.grasping, [15.0, 20.0, 25.0])
     return policy
 
@@ -325,7 +326,8 @@ def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> di
     return {
         IMAGE_KEY: torch.from_numpy(np.stack([[f[0] for f in row] for row in rows])).permute(0, 1, 4, 2, 3) / 255,
         "action": torch.tensor([[[f[1][name] for name in ACTION_NAMES] for f in row] for row in action_rows]),
-        "next.reward": torch.tensor([[f[2] for f in row] for row in rows]),
+        "next.reward": torch.tensor([row[0][2] for row in rows]),
+        "index": torch.tensor(frames),
         f"{IMAGE_KEY}_is_pad": padded,
         "action_is_pad": action_padded,
     }
@@ -378,16 +380,17 @@ def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, succes
     ],
 )
 def test_forward_learns_a_drive_as_the_replay_knows_it(outcomes, after, success, green: ReLMMPolicy, draw) -> None:
-    episode, before = make_episode(draw, *outcomes), green.rng.get_state()
-    torch.manual_seed(7)
-    loss, logs = green.forward(as_batch(green, episode, [0]))
-    torch.manual_seed(7)
-    green.rng.set_state(before)
-    batch = green.augmented(expected_batch(green, episode, after, success), green.rng)
-    noise = torch.randn(2, 1, 2)
-    expected, wanted = green.navigation.loss(batch, noise, green.config.conservative_weight)
-    assert loss.item() == pytest.approx(expected.item(), rel=1e-4)
-    assert logs == pytest.approx(wanted, rel=1e-4)
+    """Its own row tells what the robot saw and did; those of the attempts after it, in any order, what came of it."""
+    episode = make_episode(draw, *outcomes)
+    attempts = [frame for frame, (_, action, _) in enumerate(episode) if action["skill.pos"] == Skill.GRASP]
+    for frames in ([0, *attempts], [*attempts[::-1], 0]):
+        torch.manual_seed(7)
+        logs = green.forward(as_batch(green, episode, frames))[1]
+        assert logs is not None
+        torch.manual_seed(7)
+        batch, noise = expected_batch(green, episode, after, success), torch.randn(2, 1, 2)
+        wanted = green.navigation.loss(batch, noise, green.config.conservative_weight)[1]
+        assert {name: logs[name] for name in wanted} == pytest.approx(wanted, rel=1e-4)
 
 
 @pytest.mark.parametrize("outcomes", ["d", "dfffd", "dfffs"])
@@ -412,7 +415,7 @@ def test_forward_learns_attempts_with_the_loss_of_the_ensemble(green: ReLMMPolic
 
 
 def test_forward_adds_both_losses_and_update_moves_the_targets(make_policy_of: MakePolicy, draw) -> None:
-    policy = make_policy_of(seed=1, background_weight=0.0, conservative_weight=0.0, **NO_RECOLLECTION)
+    policy = make_policy_of(seed=1, background_weight=0.0, conservative_weight=0.0, **PLAIN)
     episode = make_episode(draw, *"dfdfs")
     batch = as_batch(policy, episode, range(5))
     loss, logs = policy.forward(batch)
@@ -432,34 +435,88 @@ def test_forward_remembers_maps_by_number_but_not_those_of_another_dataset(green
     losses = []
     for life in ("dfds", "ddfs"):
         batch = as_batch(green, make_episode(draw, *life), [0, 2])
-        for index in (None, torch.tensor([0, 2]), torch.tensor([0, 2])):
+        for known in (batch.keys() - {"index"}, batch, batch):
             torch.manual_seed(7)
             green.rng.manual_seed(7)
-            numbered = batch if index is None else {**batch, "index": index}
-            losses.append(green.forward(numbered)[0].item())
+            losses.append(green.forward({name: batch[name] for name in known})[0].item())
     assert losses[0] == pytest.approx(losses[1]) == pytest.approx(losses[2])
     assert losses[3] == pytest.approx(losses[4]) == pytest.approx(losses[5])
     assert losses[0] != pytest.approx(losses[3])
 
 
-@pytest.mark.parametrize(("training", "steps", "attempts"), [(True, [4, 4], [3, 3]), (False, [1, 2], [1, 1])])
+@pytest.fixture
+def shown(monkeypatch) -> Callable[[ReLMMPolicy], dict[str, list[Any]]]:
+    """What a policy's two losses are computed from, by module."""
+
+    def watch(policy: ReLMMPolicy) -> dict[str, list[Any]]:
+        seen: dict[str, list[Any]] = {"grasping": [], "navigation": []}
+        for name, arguments in seen.items():
+            loss = getattr(policy, name).loss
+            record = lambda *given, loss=loss, seen=arguments: seen.append(given[0]) or loss(*given)  # noqa: E731
+            monkeypatch.setattr(getattr(policy, name), "loss", record)
+        return seen
+
+    return watch
+
+
+@pytest.mark.parametrize(("training", "steps", "attempts"), [(True, [4, 4], [3, 3]), (False, [1], [1, 1])])
 def test_forward_tops_up_small_batches_with_what_earlier_ones_showed(
-    training, steps, attempts, make_policy_of: MakePolicy, draw, monkeypatch
+    training, steps, attempts, make_policy_of: MakePolicy, draw, shown
 ) -> None:
     """Loading is slow; to learn twice from what was loaded is not. What is new is always there."""
-    policy = make_policy_of(grasp_batch_size=3, navigation_batch_size=4, mirror=False, tidied_share=0.0)
+    policy = make_policy_of(**PLAIN | {"grasp_batch_size": 3, "navigation_batch_size": 4})
     policy.train(training)
-    episode, seen = make_episode(draw, *"dfdds"), []
-    losses = {"navigation": policy.navigation.loss, "grasping": policy.grasping.loss}
-    for module, loss in losses.items():
-        monkeypatch.setattr(getattr(policy, module), "loss", lambda *a, loss=loss: seen.append(a[0]) or loss(*a))
-    for frames in ([0, 1], [2, 3, 4]):
-        policy.forward({**as_batch(policy, episode, frames), "index": torch.tensor(frames)})
-    pictures, batches = seen[0::2], seen[1::2]
-    assert [len(each) for each in pictures] == attempts
-    assert [len(each.rewards) for each in batches] == steps
-    assert torch.equal(pictures[1][0], policy.to_pictures(episode[4][0])[0])
-    first, second = (policy.observer(policy.to_pictures(episode[frame][0]), policy.grasping)[0] for frame in (0, 2))
-    assert torch.equal(batches[1].observations[0], second)
-    assert all(torch.equal(each, first) for each in batches[0].observations)
-    assert not training or any(torch.equal(each, first) for each in batches[1].observations[2:])
+    seen, episode = shown(policy), make_episode(draw, *"ddfds")
+    for frames in ([0, 2], [1, 3, 4]):
+        policy.forward(as_batch(policy, episode, frames if training or frames[0] else [2]))
+    assert [len(pictures) for pictures in seen["grasping"]] == attempts
+    assert [len(batch.rewards) for batch in seen["navigation"]] == steps
+    new = [policy.observer(policy.to_pictures(episode[frame][0]), policy.grasping)[0] for frame in (0, 1, 3)]
+    last = seen["navigation"][-1].observations
+    assert torch.equal(last[0], new[1] if training else new[2])
+    assert torch.equal(seen["grasping"][-1][0], policy.to_pictures(episode[4][0])[0])
+    assert not training or any(torch.equal(each, new[0]) for each in last[2:])
+
+
+def test_forward_waits_until_it_knows_what_came_of_a_step(make_policy_of: MakePolicy, draw, shown) -> None:
+    """LeRobot shuffles: the attempts after a step may be in a later batch."""
+    policy = make_policy_of(**PLAIN).train()
+    seen, episode = shown(policy), make_episode(draw, *"ddfs")
+    loss, logs = policy.forward(as_batch(policy, episode, [1]))
+    assert (loss.item(), logs) == (0.0, {})
+    policy.forward(as_batch(policy, episode, [2, 0]))
+    assert seen["navigation"][-1].rewards.tolist() != [0.0], "the second drive is waiting for the second attempt"
+    policy.forward(as_batch(policy, episode, [3]))
+    assert seen["navigation"][-1].rewards.tolist() == [0.0]
+    assert len(seen["navigation"]) == 2
+
+
+def test_forward_begins_anew_when_it_remembers_too_much(make_policy_of: MakePolicy, draw, shown, monkeypatch) -> None:
+    monkeypatch.setattr("relmm.policies.relmm.offline.CAPACITY", 3)
+    policy = make_policy_of(**PLAIN | {"navigation_batch_size": 100}).train()
+    seen, episode = shown(policy), make_episode(draw, *"dddddddd")
+    old = policy.observer(policy.to_pictures(episode[0][0]), policy.grasping)[0]
+    for frames in ([0, 1, 2], [3, 4, 5], [5, 6]):
+        policy.forward(as_batch(policy, episode, frames))
+    remembered = [any(torch.equal(each, old) for each in batch.observations) for batch in seen["navigation"]]
+    assert remembered == [True, False, False]
+    assert [len(batch.rewards) for batch in seen["navigation"]] == [100, 100, 100]
+
+
+def test_forward_learns_from_tidier_maps(make_policy_of: MakePolicy, draw, shown) -> None:
+    policy = make_policy_of(
+        **PLAIN | {"tidied_share": 1.0, "navigation_batch_size": 50}, grasp_initial_logit=5.0
+    ).train()
+    seen, episode = shown(policy), make_episode(draw, *"dd")
+    policy.forward(as_batch(policy, episode, [0]))
+    whole = policy.observer(policy.to_pictures(episode[0][0]), policy.grasping)[0, 0]
+    graspable = seen["navigation"][0].observations[:, 0]
+    assert ((graspable == whole) | (graspable == 0)).all()
+    assert (graspable != whole).flatten(1).any(dim=1).float().mean() > 0.9
+
+
+def test_dataset_without_rewards_is_refused(green: ReLMMPolicy, draw) -> None:
+    batch = as_batch(green, make_episode(draw, *"dd"), [0])
+    del batch["next.reward"]
+    with pytest.raises(ConfigError, match=r"no column next\.reward"):
+        green.forward(batch)
