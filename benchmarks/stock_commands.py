@@ -49,6 +49,8 @@ COMMANDS = [
     ("trains in two processes", "accelerate launch --multi_gpu --num_processes=2 --module "
      f"lerobot.scripts.lerobot_train {TRAINING} --steps=2 --save_freq=2 --env_eval_freq=0 --output_dir=parallel",
      "parallel/checkpoints/last/pretrained_model/model.safetensors"),
+    ("trains from a stream", f"lerobot-train {TRAINING} --dataset.streaming=true --num_workers=1 --steps=2 "
+     "--save_freq=2 --env_eval_freq=0 --output_dir=streamed", "streamed/checkpoints/last/pretrained_model"),
     ("evaluates", f"lerobot-eval --policy.path={TRAINED} {EVALUATION} --output_dir=evaluated",
      "evaluated/eval_info.json"),
     ("drives the robot by a policy", f"lerobot-rollout {ROBOT} --policy.path={TRAINED} --strategy.type=base "

@@ -340,10 +340,19 @@ print(len(loaded), loaded.num_episodes)
 
 
 @pytest.mark.slow
-def test_lerobot_loads_and_streams_it_on_another_machine(hub, call, run, tmp_path):
+def test_lerobot_loads_streams_and_trains_from_it_on_another_machine(hub, call, run, tmp_path):
     status, _, errors = call(upload.main, "--dataset.repo_id=me/room", f"--dataset.root={SAMPLE}")
     assert status == 0, errors
     result = run("python", "-c", STREAM, **ONLINE, HF_HOME=str(tmp_path / "hf_there"))
     assert result.returncode == 0, result.stderr
     summary = summarize(SAMPLE)
     assert result.stdout.split() == [str(summary.frames), str(summary.episodes)]
+    trained = run(
+        "lerobot-train",
+        *("--policy.type=relmm", "--policy.device=cpu", "--policy.push_to_hub=false", "--output_dir=streamed"),
+        *("--dataset.repo_id=me/room", "--dataset.streaming=true", "--batch_size=4", "--num_workers=1", "--steps=2"),
+        **ONLINE,
+        HF_HOME=str(tmp_path / "hf_elsewhere"),
+    )
+    assert trained.returncode == 0, trained.stderr
+    assert (tmp_path / "streamed/checkpoints/last/pretrained_model/model.safetensors").is_file()
