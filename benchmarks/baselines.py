@@ -17,12 +17,13 @@ import torch
 import relmm.plugin  # noqa: F401
 from relmm.commands.evaluate import EpisodeScore, run_episode
 from relmm.commands.policies import make_actor
+from relmm.policies.controller import ControllerConfig
 from relmm.policies.random.configuration_random import RelmmRandomConfig
 from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
 from relmm.sim.env import RelmmRoomEnv
 
 ROOMS = ("no_obstacles", "obstacles", "diverse", "obstacles_rugs")
-POLICIES = {"relmm_random": RelmmRandomConfig, "relmm_scripted": RelmmScriptedConfig}
+POLICIES: dict[str, type[ControllerConfig]] = {"relmm_random": RelmmRandomConfig, "relmm_scripted": RelmmScriptedConfig}
 
 
 def evaluate(policy: str, room: str, seeds: range) -> list[EpisodeScore]:

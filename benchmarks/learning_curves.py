@@ -171,7 +171,8 @@ def main() -> None:
     arguments = parser.parse_args()
     jobs = [(run, seed) for run in arguments.runs for seed in arguments.seeds]
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        for (run, seed), folder in zip(jobs, pool.map(lambda job: train(*job, arguments.output), jobs), strict=True):
+        folders = pool.map(lambda job: train(job[0], job[1], arguments.output), jobs)
+        for (run, seed), folder in zip(jobs, folders, strict=True):
             save(read(run, seed, folder), RESULTS)
     rows = load(RESULTS)
     show(rows)

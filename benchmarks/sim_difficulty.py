@@ -340,7 +340,7 @@ class Controller:
         self._steps += 1
         if self._steps % MAX_STEPS == 0:
             self._failures[self._target] += PATIENCE
-        self._failures = np.maximum(self._failures - 0.1, 0)  # after a while an object deserves another chance
+        self._failures -= np.minimum(self._failures, 0.1)  # after a while an object deserves another chance
         return self._drive(np.array([STEP_LENGTH, 0.0])) if self._is_stuck() else self._navigate()
 
     def _is_stuck(self) -> bool:

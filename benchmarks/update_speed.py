@@ -70,7 +70,7 @@ def measure(preset: str, repeats: int) -> dict[str, object]:
 
     row = {
         "navigation_update_ms": milliseconds(update_navigation, repeats),
-        "grasp_update_ms": milliseconds(learner.update_grasping, repeats),
+        "grasp_update_ms": milliseconds(lambda: learner.update_grasping(Phase.LEARNING), repeats),
         "decision_ms": milliseconds(lambda: (policy.look(pictures), policy.navigate(pictures, trail, None)), repeats),
     }
     batches = {"navigation_batch": config.navigation_batch_size, "grasp_batch": config.grasp_batch_size}
