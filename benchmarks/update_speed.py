@@ -24,7 +24,6 @@ from relmm.features import Phase, Skill, cell_to_xy
 from relmm.learning.learner import Learner
 from relmm.learning.replay import Replay
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
-from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 OUTPUT = Path(__file__).parent / "results" / "update_speed.csv"
 FRAMES = 600
@@ -61,7 +60,7 @@ def measure(preset: str, repeats: int) -> dict[str, object]:
     rng = np.random.default_rng(0)
     policy, replay = ReLMMPolicy(config), filled_replay(rng)
     learner = Learner(policy, replay, seed=0)
-    pictures, trail = policy.to_pictures(replay.pictures(np.array([0]))[0]), np.zeros(TRAIL_FEATURES, np.float32)
+    pictures = policy.to_pictures(replay.pictures(np.array([0]))[0])
     learner.update_navigation()  # fills the maps
 
     def update_navigation() -> None:
@@ -71,7 +70,7 @@ def measure(preset: str, repeats: int) -> dict[str, object]:
     row = {
         "navigation_update_ms": milliseconds(update_navigation, repeats),
         "grasp_update_ms": milliseconds(lambda: learner.update_grasping(Phase.LEARNING), repeats),
-        "decision_ms": milliseconds(lambda: (policy.look(pictures), policy.navigate(pictures, trail, None)), repeats),
+        "decision_ms": milliseconds(lambda: (policy.look(pictures), policy.navigate(pictures, 0.0, None)), repeats),
     }
     batches = {"navigation_batch": config.navigation_batch_size, "grasp_batch": config.grasp_batch_size}
     parameters = sum(weight.numel() for weight in policy.parameters() if weight.requires_grad)

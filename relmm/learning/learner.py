@@ -9,10 +9,11 @@ import torch
 from numpy.typing import NDArray
 
 from relmm.features import Phase
-from relmm.learning.replay import Replay, to_pictures
+from relmm.learning.replay import Replay, Table, to_pictures
+from relmm.policies.relmm.batch import NavigationBatch, last_sides, n_step
 from relmm.policies.relmm.maps import Maps
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
-from relmm.policies.relmm.navigation import ACTIONS, NavigationBatch
+from relmm.policies.relmm.navigation import ACTIONS
 
 
 class RecordedEpisode(Protocol):
@@ -118,35 +119,50 @@ class Learner:
     def _navigation_loss(self) -> tuple[torch.Tensor, dict[str, float]]:
         size, replay = self.config.navigation_batch_size, self.replay
         others = round(size * self.config.pseudo_reset_share) if replay.available(replay.pseudo_reset_steps) else 0
-        rows = replay.steps.rows(replay.sample(replay.steps, size - others, self.rng))
+        chains = self._chains(replay.steps, size - others, self.config.return_steps)
         if others:
-            chosen = replay.sample(replay.pseudo_reset_steps, others, self.rng)
-            more = replay.pseudo_reset_steps.rows(chosen)
-            rows = {name: np.concatenate([rows[name], more[name]]) for name in rows}
-        batch = self.policy.augmented(self.navigation_batch(rows), self.noise)
+            # Random drives: what follows on their first step is not what the policy would do.
+            more = self._chains(replay.pseudo_reset_steps, others, 1)
+            chains = {name: np.concatenate([chains[name], more[name]]) for name in chains}
+        batch = self.policy.augmented(self.navigation_batch(chains), self.noise)
         noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)
         return self.policy.navigation.loss(batch, noise)
 
-    def navigation_batch(self, steps: dict[str, NDArray[Any]]) -> NavigationBatch:
-        """Rows of navigation steps as a batch, relabelled by the current ensemble."""
-        device, count = self.policy.weights_device, len(steps["frame"])
-        frames = np.concatenate([steps["frame"], steps["next"]])
-        trails = torch.from_numpy(self.replay.trails(frames)).to(device)
+    def _chains(self, table: Table, count: int, most: int) -> dict[str, NDArray[Any]]:
+        """Random ones of at most so many steps, as `Replay.chains` gives them, padded to `return_steps`."""
+        chains = self.replay.chains(table, self.replay.sample(table, count, self.rng), most)
+        missing = self.config.return_steps - most
+        padded = {
+            name: np.pad(chains[name], ((0, 0), (0, missing)), "edge") for name in ("frames", "success", "attempted")
+        }
+        return chains | padded
+
+    def navigation_batch(self, chains: dict[str, NDArray[Any]]) -> NavigationBatch:
+        """Navigation steps, as `Replay.chains` gives them, as a batch, relabelled by the current ensemble."""
+        device, frames = self.policy.weights_device, chains["frames"]
         observations, probabilities = (
-            each.to(device) for each in self.maps.get(frames, self._pictures, self.config.refreshed_maps)
+            each.to(device).unflatten(0, frames.shape)
+            for each in self.maps.get(frames.flatten(), self._pictures, self.config.refreshed_maps)
         )
-        success, attempted = (torch.from_numpy(steps[name]).to(device) for name in ("success", "attempted"))
-        actions = np.stack([steps["forward"], steps["turn"]], axis=1)
-        batch = NavigationBatch(
-            observations[:count],
-            trails[:count],
-            torch.from_numpy(actions).to(device),
-            success.float() - 1,
-            observations[count:],
-            trails[count:],
-            1 - success.float(),
+        success, attempted, ends, actions = (
+            torch.from_numpy(chains[name]).to(device) for name in ("success", "attempted", "lengths", "actions")
         )
-        return self.policy.relabel(batch, probabilities[count:], success, attempted)
+        rewards, continues = self.policy.rewards(probabilities[:, 1:], success, attempted)
+        rewards, continues = n_step(rewards, continues, ends, self.config.gamma)
+        # The motion of a step is that which the frame after it knows of.
+        motions = torch.from_numpy(self.replay.motions(frames)).to(device)
+        sides, chosen = last_sides(motions[..., 1]), torch.arange(len(frames), device=device)
+        there = torch.arange(frames.shape[1] - 1, device=device) < ends[:, None]
+        return NavigationBatch(
+            observations[:, 0],
+            sides[:, 0],
+            actions,
+            rewards,
+            observations[chosen, ends],
+            sides[chosen, ends],
+            continues,
+            motions[:, 1:] * there[..., None],
+        )
 
     def _pictures(self, frames: NDArray[np.int64]) -> torch.Tensor:
         return to_pictures(self.replay.pictures(frames), self.policy.weights_device)

@@ -22,7 +22,6 @@ from relmm.features import (
     Skill,
     xy_to_cell,
 )
-from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
 
 
 class Table:
@@ -80,9 +79,7 @@ class Replay:
         columns |= {"success": bool, "attempted": bool}
         self.steps, self.pseudo_reset_steps = Table(**columns), Table(**columns)
         self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)  # no memory until written to
-        self._trails = np.zeros((capacity, TRAIL_FEATURES), np.float32)
-        self._trail, self._drove = Trail(), False
-        self._resetting = False  # whether the last frame was of a pseudo-reset
+        self._motions = np.zeros((capacity, 2), np.float32)
         self._open_step: dict[str, float] | None = None  # the last navigation step, until it is known where it led
         self._open_table = self.steps  # that it belongs to
         self._first_attempt: int | None = None  # frame of the first attempt since then
@@ -111,12 +108,7 @@ class Replay:
         """
         frame, self.frames = self.frames, self.frames + 1
         self._pictures[frame % self.capacity] = picture
-        if self._resetting and phase != Phase.PSEUDO_RESET:
-            # The search begins anew, as for a policy that is asked again; the last drive leads to another memory.
-            self._trail, self._drove, self._open_step = Trail(), False, None
-        self._resetting = phase == Phase.PSEUDO_RESET
-        self._trail, self._drove = self._trail_here(motion), False
-        self._trails[frame % self.capacity] = self._trail.features()
+        self._motions[frame % self.capacity] = motion
         x_vel, theta_vel, skill, x, y = (float(value) for value in action)
         if round(skill) == Skill.GRASP:
             self.attempts.append(frame=frame, cell=xy_to_cell(x, y), success=success)
@@ -126,11 +118,8 @@ class Replay:
                 self._first_attempt = frame
             return
         self._close_step(frame)
-        if round(skill) == Skill.PLACE:
-            self._trail = Trail()  # what comes next is another search
         if round(skill) == Skill.NAVIGATE:
             self.navigation_steps += phase == Phase.LEARNING
-            self._drove = True
             forward, turn = x_vel / MAX_X_VEL * 2 - 1, theta_vel / MAX_THETA_VEL
             self._open_step = {"frame": frame, "forward": forward, "turn": turn}
             self._open_table = self.pseudo_reset_steps if phase == Phase.PSEUDO_RESET else self.steps
@@ -140,7 +129,6 @@ class Replay:
         if self._first_attempt is not None:
             self._close_step(self._first_attempt)
         self._open_step = self._first_attempt = None
-        self._trail, self._drove, self._resetting = Trail(), False, False
         self.episodes += 1
 
     def _close_step(self, following: int, success: bool = False) -> None:
@@ -160,19 +148,38 @@ class Replay:
         """The pictures of frames, uint8 (n, 100, 100, 3)."""
         return self._pictures[frames % self.capacity]
 
-    def trails(self, frames: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Where the robot had just been, `Trail.features`, (n, 21)."""
-        return self._trails[frames % self.capacity]
+    def motions(self, frames: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Velocities of the last navigation steps before frames, m/s and deg/s, shaped (..., 2)."""
+        return self._motions[frames % self.capacity]
 
-    def next_trail(self, motion: tuple[float, float]) -> NDArray[np.float32]:
-        """The trail of a step of the policy that would come next, for an observation with this motion, (21,)."""
-        return (Trail() if self._resetting else self._trail_here(motion)).features()
+    def chains(self, table: Table, rows: NDArray[np.int64], length: int) -> dict[str, NDArray[Any]]:
+        """Navigation steps and those that followed on them, until a success.
 
-    def _trail_here(self, motion: tuple[float, float]) -> Trail:
-        trail = self._trail.copy()
-        if self._drove:
-            trail.moved(*motion)
-        return trail
+        Args:
+            table: `steps` or `pseudo_reset_steps`.
+            rows: the first ones', (n,).
+            length: of a chain, at most.
+
+        Returns:
+            `frames`, before and after each step, (n, length + 1), and its `success` and whether grasps were
+            `attempted`, (n, length), where what lies behind the end repeats it; `lengths`, (n,); and `actions`, the
+            first steps' `forward` and `turn`, (n, 2).
+        """
+        indices = rows[:, None] + np.arange(length)
+        columns = table.rows(np.minimum(indices, len(table) - 1))
+        follows = (columns["frame"][:, 1:] == columns["next"][:, :-1]) & ~columns["success"][:, :-1]
+        lengths = 1 + np.logical_and.accumulate(follows & (indices[:, 1:] < len(table)), axis=1).sum(axis=1)
+        last = np.minimum(np.arange(length), lengths[:, None] - 1)
+        after, success, attempted = (
+            np.take_along_axis(columns[name], last, axis=1) for name in ("next", "success", "attempted")
+        )
+        return {
+            "frames": np.concatenate([columns["frame"][:, :1], after], axis=1),
+            "success": success,
+            "attempted": attempted,
+            "lengths": lengths,
+            "actions": np.stack([columns["forward"][:, 0], columns["turn"][:, 0]], axis=1),
+        }
 
     def available(self, table: Table) -> int:
         """How many rows of one of the tables have pictures that are still there."""

@@ -127,8 +127,7 @@ class Trainer:
     def _navigation_action(self) -> dict[str, float]:
         if self.progress.steps < self.config.random_steps:
             return drive_anywhere(self._rng)
-        motion = (self.life.observation["x.vel"], self.life.observation["theta.vel"])
-        return self.policy.navigate(self._pictures(), self.learner.replay.next_trail(motion), self.policy.rng)
+        return self.policy.navigate(self._pictures(), self.life.observation["theta.vel"], self.policy.rng)
 
     def _pseudo_reset(self) -> None:
         for action in pseudo_reset(self._rng, self._pseudo_reset_steps, lambda: self.life.holding):

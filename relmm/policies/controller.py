@@ -143,9 +143,6 @@ class ControllerPolicy(PreTrainedPolicy):
             row: what is remembered about this robot.
         """
 
-    def forget_search(self, row: Row) -> None:
-        """Something was picked up: what comes next is another search."""
-
     def reset(self) -> None:
         """Begin new episodes."""
         self._episodes += len(self._rows)
@@ -165,7 +162,6 @@ class ControllerPolicy(PreTrainedPolicy):
     def _act(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
         if state[_HOLDING] > 0.5:
             row.attempts = 0
-            self.forget_search(row)
             return action_dict(Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
         action = self.decide(image, state, row)
         row.attempts = row.attempts + 1 if action["skill.pos"] == Skill.GRASP else 0

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
 import relmm.plugin  # noqa: F401
-from relmm.features import FPS, GRID, IMAGE_KEY, Phase, Skill, cell_to_xy
+from relmm.features import FPS, GRID, IMAGE_KEY, STATE_KEY, Phase, Skill, cell_to_xy
 from relmm.geometry import CAMERAS
 from relmm.learning.learner import Learner
 from relmm.learning.replay import Replay, to_pictures
 from relmm.policies.controller import grasp_cell
+from relmm.policies.relmm.batch import last_sides
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
-from relmm.policies.relmm.trail import HISTORY
 
 SKILLS = {"d": Skill.NAVIGATE, "r": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
 SMALL = {"grasp_batch_size": 8, "navigation_batch_size": 8, "min_attempts_to_update": 3, "min_steps_to_update": 3}
@@ -170,7 +170,7 @@ def test_equal_seeds_learn_the_same(make_learner) -> None:
 def test_navigation_batch_is_that_of_its_frames(relabel: bool, failed: bool, make_learner, numbered) -> None:
     learner = make_learner("dfdfs dfdss rrddd", relabel=relabel, relabel_failed=failed, refreshed_maps=0)
     policy, steps = learner.policy, learner.replay.steps
-    batch = learner.navigation_batch(steps.rows(np.arange(len(steps))))
+    batch = learner.navigation_batch(learner.replay.chains(steps, np.arange(len(steps)), 1))
     columns = (steps["frame"], steps["next"], steps["success"], steps["attempted"])
     for row, (frame, after, success, attempted) in enumerate(zip(*columns, strict=True)):
         pictures = to_pictures(np.stack([numbered(frame), numbered(after)]), torch.device("cpu"))
@@ -179,11 +179,46 @@ def test_navigation_batch_is_that_of_its_frames(relabel: bool, failed: bool, mak
         chance = 0.0 if success or not relabel or (attempted and not failed) else chance
         assert (batch.observations[row].int() - observations[0]).abs().max() <= 1
         assert (batch.next_observations[row].int() - observations[1]).abs().max() <= 1
-        trails = learner.replay.trails(np.array([frame, after]))
-        assert np.array_equal(torch.stack([batch.trails[row], batch.next_trails[row]]), trails)
+        motions = torch.from_numpy(learner.replay.motions(np.array([frame, after])))
+        assert torch.equal(torch.stack([batch.sides[row], batch.next_sides[row]]), last_sides(motions[:, 1]))
+        assert torch.equal(batch.motions[row, 0], motions[1])
         assert batch.rewards[row].item() == pytest.approx(float(success) - 1 + chance, abs=1e-5)
         assert batch.continues[row].item() == pytest.approx(1 - float(success) - chance * (not success), abs=1e-5)
         assert batch.actions[row].tolist() == pytest.approx([2 * frame / 1000 - 1, frame / 1000], abs=1e-6)
+
+
+def test_chain_of_steps_is_one_from_the_first_frame_to_the_last(make_learner, numbered) -> None:
+    """With the rewards on the way, relabelled; after the end there is no motion."""
+    learner = make_learner("dddds", refreshed_maps=0)
+    policy, gamma = learner.policy, learner.config.gamma
+    batch = learner.navigation_batch(learner.replay.chains(learner.replay.steps, np.array([0, 2]), 3))
+    for row, frames in enumerate([[0, 1, 2, 3], [2, 3, 4]]):
+        pictures = to_pictures(np.stack([numbered(frame) for frame in frames]), torch.device("cpu"))
+        chances = policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1:].tolist()
+        rewards, going_on = [chance - 1 for chance in chances], [1 - chance for chance in chances]
+        if row == 1:
+            rewards[-1], going_on[-1] = 0.0, 0.0
+        expected = sum(gamma**k * np.prod(going_on[:k]) * reward for k, reward in enumerate(rewards))
+        assert batch.rewards[row].item() == pytest.approx(expected, rel=1e-4)
+        assert batch.continues[row].item() == pytest.approx(gamma ** (len(rewards) - 1) * np.prod(going_on), rel=1e-4)
+        observations = policy.observer(pictures, policy.grasping).int()
+        assert (batch.observations[row].int() - observations[0]).abs().max() <= 1
+        assert (batch.next_observations[row].int() - observations[-1]).abs().max() <= 1
+        motions = torch.from_numpy(learner.replay.motions(np.array(frames[1:])))
+        assert torch.equal(batch.motions[row, : len(rewards)], motions)
+        assert not batch.motions[row, len(rewards) :].any()
+
+
+def test_critics_learn_from_chains_of_the_policy_but_not_of_pseudo_resets(make_learner, monkeypatch) -> None:
+    learner = make_learner("dddddd rrrrrr", return_steps=3, navigation_updates=10)
+    given: list[dict[str, NDArray[Any]]] = []
+    original = learner.navigation_batch
+    monkeypatch.setattr(learner, "navigation_batch", lambda chains: (given.append(chains), original(chains))[1])
+    learner.update_navigation()
+    lengths, resets = (np.concatenate([chains[name] for chains in given]) for name in ("lengths", "frames"))
+    resets = resets[:, 0] >= 6
+    assert set(lengths[resets].tolist()) == {1}
+    assert set(lengths[~resets].tolist()) == {1, 2, 3}
 
 
 @pytest.mark.parametrize(
@@ -194,7 +229,9 @@ def test_pseudo_resets_have_their_share_of_a_batch(life, share, expected, make_l
     learner = make_learner(life, pseudo_reset_share=share, navigation_updates=1)
     given: list[NDArray[np.int64]] = []
     original = learner.navigation_batch
-    monkeypatch.setattr(learner, "navigation_batch", lambda rows: (given.append(rows["frame"]), original(rows))[1])
+    monkeypatch.setattr(
+        learner, "navigation_batch", lambda chains: (given.append(chains["frames"][:, 0]), original(chains))[1]
+    )
     learner.update_navigation()
     assert len(given[0]) == 8
     assert (given[0] >= 4).sum() == expected
@@ -251,7 +288,7 @@ def test_recorded_episode_fills_the_replay_as_living_it_does(make_learner, recor
         for name, column in read.rows(rows).items():
             assert column == pytest.approx(wanted.rows(rows)[name], abs=1e-6)
     frames = np.arange(7)
-    assert learner.replay.trails(frames) == pytest.approx(lived.replay.trails(frames), abs=1e-6)
+    assert learner.replay.motions(frames) == pytest.approx(lived.replay.motions(frames), abs=1e-6)
     assert (learner.replay.frames, learner.replay.episodes) == (7, 1)
     assert learner.logs == {}
 
@@ -277,11 +314,17 @@ def test_frozen_ensemble_learns_from_recorded_curricula_only(make_learner, recor
 
 
 def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> None:
-    """LeRobot's dataset, batches and preprocessor against the replay, for odometry that agrees with the actions."""
-    alone = {"background_weight": 0.0, "conservative_weight": 0.0, "mirror": False, "tidied_share": 0.0}
+    """LeRobot's dataset, batches and preprocessor against the replay."""
+    alone = {
+        "return_steps": 1,
+        "background_weight": 0.0,
+        "conservative_weight": 0.0,
+        "mirror": False,
+        "tidied_share": 0.0,
+    }
     policy = make_policy(refreshed_maps=0, **alone, seed=2)
     deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
-    columns = {IMAGE_KEY: deltas}
+    columns = {IMAGE_KEY: deltas, STATE_KEY: deltas}
     columns["action"] = [delta / FPS for delta in policy.config.action_delta_indices]
     frames = list(LeRobotDataset("local/diverse", root=RECORDED, delta_timestamps=columns, episodes=[0, 1, 2]))
     learner, episode = Learner(policy, Replay(len(frames)), seed=0), 0
@@ -291,8 +334,8 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
         episode = frame["episode_index"]
         picture = (frame[IMAGE_KEY][0] * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
         success = bool(frame["next.reward"] > 0)
-        motion, action = frame["action"][HISTORY - 1, :2].tolist(), frame["action"][HISTORY]
-        learner.replay.add(picture, motion, action, success, Phase.LEARNING)
+        motion = frame[STATE_KEY][0, :2].tolist()
+        learner.replay.add(picture, motion, frame["action"][0], success, Phase.LEARNING)
     learner.replay.save_episode()
     policy.eval()
 
@@ -301,8 +344,8 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
     loss, logs = policy.forward(batch)
 
     replay = learner.replay
-    steps = learner.navigation_batch(replay.steps.rows(np.arange(len(replay.steps))))
-    assert steps.trails.any()
+    steps = learner.navigation_batch(replay.chains(replay.steps, np.arange(len(replay.steps)), 1))
+    assert set(steps.sides.tolist()) == {-1, 1}
     torch.manual_seed(3)
     navigation_loss, wanted = policy.navigation.loss(steps, torch.randn(2, len(replay.steps), 2))
     pictures = to_pictures(replay.pictures(replay.attempts["frame"]), torch.device("cpu"))

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from relmm.features import FRONT, GRID, MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES, Phase, Skill, action_dict
-from relmm.learning.actor import to_batch
+from relmm.features import FRONT, GRID, MAX_THETA_VEL, MAX_X_VEL, Phase, Skill, action_dict
 from relmm.learning.replay import Replay, Table, to_pictures
 from relmm.policies.controller import grasp_cell
-from relmm.policies.relmm.trail import Trail
 
 # Episodes of drives (d), drives of pseudo-resets (r), attempts that fail (f) or do not (s), and placements (p).
 Life = list[str]
@@ -73,29 +71,10 @@ def steps_of(life: Life, kind: str) -> list[Step]:
     for episode in life:
         for index, each in enumerate(episode):
             outcome = step_of(episode, index)
-            ends_a_pseudo_reset = each == "r" and episode[index + 1 : index + 2] not in ("", "r")
-            if each == kind and outcome is not None and not ends_a_pseudo_reset:
+            if each == kind and outcome is not None:
                 steps.append(Step(start + index, start + outcome[0], outcome[1]))
         start += len(episode)
     return steps
-
-
-def trails_of(life: Life, motion_of) -> np.ndarray:
-    """Of each frame, slowly: the drives before it, with the motions that the frames after them saw.
-
-    They count since the beginning of the episode, and of the search after a placement or a pseudo-reset.
-    """
-    trails, start = [], 0
-    for episode in life:
-        for index in range(len(episode)):
-            trail = Trail()
-            ends = [k for k in range(1, index + 1) if episode[k - 1] == "p" or episode[k - 1] == "r" != episode[k]]
-            for earlier in range(max(ends, default=0), index):
-                if episode[earlier] in "dr":
-                    trail.moved(*motion_of(start + earlier + 1))
-            trails.append(trail.features())
-        start += len(episode)
-    return np.array(trails)
 
 
 def rows_of(table: Table) -> list[Step]:
@@ -157,58 +136,49 @@ def test_actions_and_pictures_are_those_of_their_frames(seed: int, fill: Fill, n
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_trails_hold_the_drives_of_their_episode(seed: int, fill: Fill, motion_of) -> None:
-    life = random_life(seed)
+def test_motions_are_those_that_the_frames_know_of(seed: int, fill: Fill, motion_of) -> None:
+    replay = fill(random_life(seed))
+    frames = np.arange(replay.frames)
+    assert np.allclose(replay.motions(frames), [motion_of(frame) for frame in frames.tolist()], atol=1e-5)
+
+
+# --- Chains --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("length", [1, 3, 5])
+@pytest.mark.parametrize("seed", range(8))
+def test_chains_follow_the_steps_until_a_success(length: int, seed: int, fill: Fill) -> None:
+    """As one who walks from step to step."""
+    replay = fill(random_life(seed))
+    steps = {int(frame): row for row, frame in enumerate(replay.steps["frame"])}
+    chains = replay.chains(replay.steps, np.arange(len(replay.steps)), length)
+    for row in range(len(replay.steps)):
+        walk = [row]
+        while len(walk) < length and not replay.steps["success"][walk[-1]]:
+            after = int(replay.steps["next"][walk[-1]])
+            if after not in steps:
+                break
+            walk.append(steps[after])
+        assert chains["lengths"][row] == len(walk)
+        walk += walk[-1:] * (length - len(walk))
+        assert chains["frames"][row].tolist() == [replay.steps["frame"][row], *replay.steps["next"][walk]]
+        assert chains["actions"][row].tolist() == [replay.steps["forward"][row], replay.steps["turn"][row]]
+        for name in ("success", "attempted"):
+            assert chains[name][row].tolist() == replay.steps[name][walk].tolist()
+
+
+@pytest.mark.parametrize(
+    ("life", "lengths"),
+    [
+        (["dddd"], [3, 2, 1]),
+        (["dfdd"], [2, 1]),
+        (["dsd"], [1]),
+        (["dpdd"], [1, 1]),
+        (["ddrdd"], [2, 1, 1]),
+        (["dd", "dd"], [1, 1]),
+    ],
+)
+def test_chain_ends_where_something_else_was_done(life: Life, lengths: list[int], fill: Fill) -> None:
     replay = fill(life)
-    assert replay.trails(np.arange(replay.frames)) == pytest.approx(trails_of(life, motion_of), abs=1e-6)
-
-
-def test_next_trail_is_that_of_the_frame_to_come(numbered, action_of) -> None:
-    replay = Replay(10)
-    for kind in "dfdd":
-        motion = (0.1 + 0.01 * replay.frames, 20.0)
-        expected = replay.next_trail(motion)
-        assert np.array_equal(replay.next_trail(motion), expected), "to ask changes nothing"
-        replay.add(numbered(0), motion, action_of(SKILLS[kind], 0), False, Phase.LEARNING)
-        assert np.array_equal(replay.trails(np.array([replay.frames - 1]))[0], expected)
-
-
-def test_search_after_a_pseudo_reset_begins_with_a_new_trail(numbered, action_of) -> None:
-    """As for a policy that was not asked meanwhile."""
-    replay = Replay(10)
-    for phase in [Phase.LEARNING, Phase.LEARNING, Phase.PSEUDO_RESET, Phase.PSEUDO_RESET, Phase.LEARNING]:
-        before = replay.next_trail((0.2, 30.0))
-        replay.add(numbered(0), (0.2, 30.0), action_of(Skill.NAVIGATE, 0), False, phase)
-    trails = replay.trails(np.arange(5))
-    assert [bool(trail.any()) for trail in trails] == [False, True, True, True, False]
-    assert not before.any()
-    assert replay.next_trail((0.2, 30.0)).any()
-
-
-@pytest.mark.parametrize("sample", [True, False])
-def test_policy_and_replay_agree_on_the_trail(sample: bool, make_policy, numbered, monkeypatch) -> None:
-    """Over drives, attempts and placements, after a pseudo-reset of which the policy knows nothing."""
-    policy, replay, rng = make_policy(sample=sample, grasp_threshold=0.25), Replay(200), np.random.default_rng(0)
-    given: list[np.ndarray] = []
-    navigate = policy.navigate
-    monkeypatch.setattr(policy, "navigate", lambda *asked: (given.append(asked[1]), navigate(*asked))[1])
-    drive = list(action_dict(x_vel=0.2, theta_vel=30.0).values())
-    for _ in range(3):
-        replay.add(numbered(0), (0.2, 30.0), drive, False, Phase.PSEUDO_RESET)
-    motion, skills, next_trails = (0.2, 30.0), [], []
-    for number in range(80):
-        holding = skills[-1:] == [Skill.GRASP] and rng.random() < 0.2
-        state = {**dict.fromkeys(STATE_NAMES, 0.0), "x.vel": motion[0], "theta.vel": motion[1], "holding.pos": holding}
-        action = policy.select_action(to_batch({FRONT: numbered(number), **state}))[0].tolist()
-        skills.append(round(action[2]))
-        next_trails.append(replay.next_trail(motion))
-        replay.add(numbered(number), motion, action, False, Phase.LEARNING)
-        if skills[-1] == Skill.NAVIGATE:
-            motion = float(rng.uniform(0, MAX_X_VEL)), float(rng.uniform(-MAX_THETA_VEL, MAX_THETA_VEL))
-    assert set(skills) == set(Skill)
-    drives = np.flatnonzero(np.array(skills) == Skill.NAVIGATE)
-    assert replay.trails(drives + 3) == pytest.approx(np.array(given), abs=1e-5)
-    assert np.array_equal(replay.trails(drives + 3), np.array(next_trails)[drives])
+    assert replay.chains(replay.steps, np.arange(len(replay.steps)), 3)["lengths"].tolist() == lengths
 
 
 def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> None:
@@ -220,9 +190,9 @@ def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> N
     assert lengths == [0, 0, 0, 1]
 
 
-def test_last_drive_of_a_pseudo_reset_leads_to_another_memory_and_is_left_out(fill: Fill) -> None:
+def test_last_drive_of_a_pseudo_reset_leads_to_the_next_search(fill: Fill) -> None:
     replay = fill(["rrd" + "d"])
-    assert rows_of(replay.pseudo_reset_steps) == [Step(0, 1, False)]
+    assert rows_of(replay.pseudo_reset_steps) == [Step(0, 1, False), Step(1, 2, False)]
     assert rows_of(replay.steps) == [Step(2, 3, False)]
 
 
@@ -258,9 +228,9 @@ def test_frames_are_taken_as_recorders_take_them(numbered) -> None:
         "frame": [0], "next": [1], "forward": [1.0], "turn": [-0.5], "success": [True], "attempted": [True]
     }  # fmt: skip
     assert replay.attempts["cell"].tolist() == [17]
-    driven = Trail()
-    driven.moved(MAX_X_VEL, 0.5 * MAX_THETA_VEL)
-    assert np.array_equal(replay.trails(np.array([0, 1])), [Trail().features(), driven.features()])
+    assert replay.motions(np.array([0, 1])) == pytest.approx(
+        np.array([[0, 0.5 * MAX_THETA_VEL], [MAX_X_VEL, 0.5 * MAX_THETA_VEL]])
+    )
     assert np.array_equal(replay.pictures(np.array([1]))[0], numbered(1))
 
 
@@ -280,7 +250,7 @@ def test_what_is_sampled_still_has_its_pictures(capacity: int, seed: int, fill: 
         assert [number_of(image) for image in replay.pictures(frames)] == frames.tolist()
     after = replay.steps["next"][replay.sample(replay.steps, 50, rng)]
     assert [number_of(image) for image in replay.pictures(after)] == after.tolist()
-    assert replay.trails(after) == pytest.approx(trails_of(life, motion_of)[after], abs=1e-6)
+    assert np.allclose(replay.motions(after), [motion_of(frame) for frame in after.tolist()], atol=1e-5)
 
 
 def test_rows_are_sampled_uniformly(fill: Fill) -> None:

@@ -106,7 +106,7 @@ class FakePolicy:
     def look(self, image: np.ndarray) -> None:
         self.grasp_probability = 1.0 if image.max() else self.floor_probability
 
-    def navigate(self, image: np.ndarray, trail: np.ndarray, rng: object) -> dict[str, float]:
+    def navigate(self, image: np.ndarray, theta_vel: float, rng: object) -> dict[str, float]:
         return POLICY_DRIVE
 
 
@@ -120,9 +120,6 @@ class FakeReplay:
     @property
     def attempts_since_first_success(self) -> int:
         return self._world.attempts_since_first_success
-
-    def next_trail(self, motion: tuple[float, float]) -> np.ndarray:
-        return np.array(motion)
 
 
 class FakeLearner:

@@ -12,7 +12,6 @@ from lerobot.optim.optimizers import AdamConfig
 from relmm.errors import ConfigError
 from relmm.geometry import camera_geometry
 from relmm.policies.controller import ControllerConfig
-from relmm.policies.relmm.trail import HISTORY
 
 GRASP_BACKBONES = ("rectified", "dense")
 NAVIGATION_ENCODERS = ("floor", "paper", "paper_small")
@@ -65,6 +64,7 @@ class ReLMMConfig(ControllerConfig):
         random_steps: navigation steps with uniform actions at first.
         min_steps_to_update: transitions stored before the first update.
         gamma: discount of a navigation step.
+        return_steps: n of the n-step returns that the critics learn from; 1 for pseudo-resets, whose drives are random.
         tau: step of the target networks' moving average.
         actor_tau: step of the moving average of the actor that greedy actions come from; 1 for the actor itself.
         target_entropy: of SAC's temperature.
@@ -120,9 +120,10 @@ class ReLMMConfig(ControllerConfig):
     random_steps: int = 50
     min_steps_to_update: int = 100
     gamma: float = 0.98
+    return_steps: int = 3
     tau: float = 0.01
     actor_tau: float = 0.01
-    target_entropy: float = -2.0
+    target_entropy: float = 0.0  # with less, it only ever turns as fast as it can
     initial_temperature: float = 0.1
     clip_targets: bool = True
     conservative_weight: float = 0.5
@@ -154,8 +155,8 @@ class ReLMMConfig(ControllerConfig):
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """As the observations, and those before, which tell where the robot has just been."""
-        return [*range(-HISTORY, 0), *self.observation_delta_indices]
+        """As the observations."""
+        return self.observation_delta_indices
 
     def get_optimizer_preset(self) -> AdamConfig:
         """For `lerobot-train`, which has one optimiser; the learning rates are in the policy's parameter groups."""
@@ -194,7 +195,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "navigation_updates": (0, math.inf),
     "random_steps": (0, math.inf),
     "min_steps_to_update": (1, math.inf),
-    "gamma": (0, 0.9999),
+    "gamma": (_TINY, 0.9999),
+    "return_steps": (1, 100),
     "tau": (_TINY, 1),
     "actor_tau": (_TINY, 1),
     "target_entropy": (-100, 100),

@@ -15,7 +15,6 @@ from relmm.geometry import camera_geometry
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.floor import FloorView
 from relmm.policies.relmm.grasping import GraspEnsemble, RectifiedBackbone
-from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 # A pixel of the navigation map is 7x7 grasp cells, 7.7 cm. The map reaches 2.4 m ahead and 1.2 m to either side: as
 # far as a grown ensemble recognises what it has learned at arm's length.
@@ -145,7 +144,7 @@ class Keypoints(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Features of a navigation observation: convolutions; for a map of the floor also keypoints and the robot's trail.
+    """Features of a navigation observation: convolutions; for a map of the floor also keypoints.
 
     Args:
         kind: as in `ReLMMConfig.navigation_encoder`.
@@ -161,23 +160,15 @@ class Encoder(nn.Module):
         self.on_floor = kind == "floor"
         if self.on_floor:
             self.keypoints = Keypoints()
-            self.embed = nn.Sequential(nn.Linear(Keypoints.features + TRAIL_FEATURES, _POINT_FEATURES), nn.ReLU())
+            self.embed = nn.Sequential(nn.Linear(Keypoints.features, _POINT_FEATURES), nn.ReLU())
         with torch.no_grad():
-            self.features: int = self(torch.zeros(1, *shape), torch.zeros(1, TRAIL_FEATURES)).shape[1]
+            self.features: int = self(torch.zeros(1, *shape)).shape[1]
 
-    def forward(self, observations: Tensor, trails: Tensor) -> Tensor:
-        """Features, (batch, features).
-
-        Args:
-            observations: uint8, (batch, channels, height, width).
-            trails: where the robot has just been, `Trail.features`, (batch, 21).
-        """
+    def forward(self, observations: Tensor) -> Tensor:
+        """Features, (batch, features), of uint8 observations, (batch, channels, height, width)."""
         scaled = observations.float() / 127.5 - 1
         encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))
-        if not self.on_floor:
-            return encoded
-        points = self.embed(torch.cat([self.keypoints(scaled), trails], dim=1))
-        return torch.cat([encoded, points], dim=1)
+        return torch.cat([encoded, self.embed(self.keypoints(scaled))], dim=1) if self.on_floor else encoded
 
 
 def _paper_layers() -> list[nn.Module]:

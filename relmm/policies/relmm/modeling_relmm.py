@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.features import IMAGE_KEY
+from relmm.features import IMAGE_KEY, STATE_NAMES
 from relmm.policies.controller import ControllerPolicy, Row, grasp_cell
+from relmm.policies.relmm.batch import NavigationBatch, last_sides
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import FloorObserver, make_observer
 from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm.maps import Maps
-from relmm.policies.relmm.navigation import ACTIONS, Navigation, NavigationBatch, to_navigation_step
+from relmm.policies.relmm.navigation import ACTIONS, Navigation, to_navigation_step
 from relmm.policies.relmm.offline import CAPACITY, Batch, Recollection, Rows
-from relmm.policies.relmm.trail import Trail
+
+_TURN = STATE_NAMES.index("theta.vel")
 
 
 class ReLMMPolicy(ControllerPolicy):
@@ -54,19 +55,10 @@ class ReLMMPolicy(ControllerPolicy):
         """See `ControllerPolicy.decide`: greedily, or as while training if `sampling`."""
         pictures = self.to_pictures(image)
         estimate = self.look(pictures)
-        trail: Trail = row.memory.setdefault("trail", Trail())
-        if row.memory.pop("drove", False):
-            trail.moved(float(state[0]), float(state[1]))
         rng = self._rng_of(row) if self.sampling else None
         if row.attempts < self.config.num_grasp and self._wants_to_grasp(estimate, row.attempts, rng):
             return self.grasp(estimate, rng)
-        row.memory["drove"] = True
-        return self.navigate(pictures, trail.features(), rng)
-
-    def forget_search(self, row: Row) -> None:
-        """Begin with an empty trail, as training does after a pseudo-reset."""
-        row.memory.pop("trail", None)
-        row.memory.pop("drove", None)
+        return self.navigate(pictures, float(state[_TURN]), rng)
 
     def look(self, pictures: Tensor) -> Estimate:
         """The ensemble's opinion of pictures 0..1 (batch, 3, 100, 100), which is also remembered."""
@@ -83,11 +75,17 @@ class ReLMMPolicy(ControllerPolicy):
         cells = estimate.mean.argmax(dim=1) if rng is None else self.grasping.sample(estimate, rng)
         return grasp_cell(int(cells[0]))
 
-    def navigate(self, pictures: Tensor, trail: NDArray[np.float32], rng: torch.Generator | None) -> dict[str, float]:
-        """A navigation step for one picture and trail: sampled, or the mean action without random numbers."""
+    def navigate(self, pictures: Tensor, theta_vel: float, rng: torch.Generator | None) -> dict[str, float]:
+        """A navigation step: sampled, or the mean action without random numbers.
+
+        Args:
+            pictures: one, 0..1, (1, 3, 100, 100).
+            theta_vel: of the last navigation step, deg/s.
+            rng: to sample with.
+        """
         observations = self.observer(pictures, self.grasping)
-        trails = torch.from_numpy(trail[None]).to(self.weights_device)
-        action = self.navigation.act(observations, trails, rng)[0]
+        sides = last_sides(torch.tensor([theta_vel], device=self.weights_device))
+        action = self.navigation.act(observations, sides, rng)[0]
         return to_navigation_step(action.tolist())
 
     def to_pictures(self, image: NDArray[Any]) -> Tensor:
@@ -187,23 +185,22 @@ class ReLMMPolicy(ControllerPolicy):
             {"params": navigation, "lr": self.config.navigation_learning_rate},
         ]
 
-    def relabel(
-        self, batch: NavigationBatch, probabilities: Tensor, success: Tensor, attempted: Tensor
-    ) -> NavigationBatch:
-        """Reward steps without success with what the current ensemble makes of where they led (paper 4.2).
+    def rewards(self, probabilities: Tensor, success: Tensor, attempted: Tensor) -> tuple[Tensor, Tensor]:
+        """Rewards of navigation steps, and whether the search goes on after them, shaped like the arguments.
+
+        Steps without success are rewarded with what the current ensemble makes of where they led (paper 4.2).
 
         Args:
-            batch: with rewards of -1 and 0.
-            probabilities: P[grasp] at the next observations, (batch,).
-            success: which steps led to one, (batch,) bool.
-            attempted: after which steps grasps were attempted, (batch,) bool.
+            probabilities: P[grasp] at the next observations.
+            success: which steps led to one, bool.
+            attempted: after which steps grasps were attempted, bool.
         """
+        rewards, continues = success.float() - 1, 1 - success.float()
         if not self.config.relabel:
-            return batch
+            return rewards, continues
         known = success if self.config.relabel_failed else success | attempted
         chance = torch.where(known, 0.0, probabilities)
-        continues = batch.continues * (1 - chance) if self.config.relabel_terminal else batch.continues
-        return replace(batch, rewards=batch.rewards + chance, continues=continues)
+        return rewards + chance, continues * (1 - chance) if self.config.relabel_terminal else continues
 
     def augmented(self, batch: NavigationBatch, rng: torch.Generator) -> NavigationBatch:
         """Navigation steps as they might have been as well: see `mirror` and `tidied_share`."""
@@ -217,17 +214,18 @@ class ReLMMPolicy(ControllerPolicy):
         frames = np.concatenate([steps["frame"], steps["next"]])
         observations, probabilities = map(self._on_device, self._maps.get(frames, find, self.config.refreshed_maps))
         success, attempted = (self._on_device(steps[name]) for name in ("success", "attempted"))
-        trails, count = self._on_device(steps["trails"]), len(steps)
-        batch = NavigationBatch(
+        count, sides = len(steps), last_sides(self._on_device(steps["turns"]))
+        rewards, continues = self.rewards(probabilities[count:], success, attempted)
+        return NavigationBatch(
             observations[:count],
-            trails[:, 0],
+            sides[:, 0],
             self._on_device(steps["action"]),
-            success.float() - 1,
+            rewards,
             observations[count:],
-            trails[:, 1],
-            1 - success.float(),
+            sides[:, 1],
+            continues,
+            self._on_device(steps["motion"])[:, None],
         )
-        return self.relabel(batch, probabilities[count:], success, attempted)
 
     def _on_device(self, values: Tensor | NDArray[Any]) -> Tensor:
         return torch.as_tensor(values).to(self.weights_device)

@@ -4,67 +4,19 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
+from relmm.policies.relmm.batch import NavigationBatch
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import NOTICED, Encoder
-from relmm.policies.relmm.tidying import tidy
-from relmm.policies.relmm.trail import MIRROR, last_sides
 
 ACTIONS = 2  # forward and turn, each -1..1
 _LOG_STD_RANGE = (-5.0, 2.0)
-_NOT_ALL = 0.8  # share of the steps with a tidied floor in which something is left
 _UNIFORM_ACTIONS = 10  # that conservative Q-learning compares the taken one with
-
-
-@dataclass
-class NavigationBatch:
-    """Navigation steps to learn from.
-
-    Attributes:
-        observations, next_observations: uint8, (batch, channels, height, width).
-        trails, next_trails: where the robot had just been, `Trail.features`, (batch, 21).
-        actions: -1..1, (batch, 2).
-        rewards: -1..0, (batch,).
-        continues: 1 where the search goes on, 0 after a success, or the probability of that, (batch,).
-    """
-
-    observations: Tensor
-    trails: Tensor
-    actions: Tensor
-    rewards: Tensor
-    next_observations: Tensor
-    next_trails: Tensor
-    continues: Tensor
-
-    def mirrored(self) -> NavigationBatch:
-        """The same with left and right exchanged; for maps of the floor, whose columns are symmetric."""
-        sign = torch.tensor([1.0, -1.0], device=self.actions.device)
-        return replace(
-            self,
-            observations=self.observations.flip(-1),
-            trails=self.trails * MIRROR.to(sign.device),
-            actions=self.actions * sign,
-            next_observations=self.next_observations.flip(-1),
-            next_trails=self.next_trails * MIRROR.to(sign.device),
-        )
-
-    def tidied(self, share: float, rng: torch.Generator) -> NavigationBatch:
-        """The same, but in a share of the steps part of what lay about is gone; for maps of the floor.
-
-        How much, is uniform, as it is over the time in which a room is tidied; in a fifth of them it is everything.
-        """
-        count = len(self.rewards)
-        empty = torch.rand(count, generator=rng) / _NOT_ALL
-        empty[torch.rand(count, generator=rng) >= share] = 0.0
-        empty = empty.to(self.rewards.device)
-        before, after = tidy(self.observations, self.next_observations, self.next_trails, empty, rng)
-        return replace(self, observations=before, next_observations=after)
 
 
 class Actor(nn.Module):
@@ -114,9 +66,9 @@ class Critics(nn.Module):
         self.features = first.features
         self.heads = nn.ModuleList([_dense_layers(config, self.features + ACTIONS, 1) for _ in range(2)])
 
-    def encode(self, observations: Tensor, trails: Tensor) -> list[Tensor]:
+    def encode(self, observations: Tensor) -> list[Tensor]:
         """Features for each head, two of (batch, features)."""
-        encoded = [encoder(observations, trails) for encoder in self.encoders]
+        encoded = [encoder(observations) for encoder in self.encoders]
         return encoded * 2 if len(encoded) == 1 else encoded
 
     def forward(self, features: list[Tensor], actions: Tensor) -> Tensor:
@@ -146,14 +98,14 @@ class Navigation(nn.Module):
         self.mean_encoder = copy.deepcopy(self._encoder).requires_grad_(False)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.initial_temperature)))
 
-    def act(self, observations: Tensor, trails: Tensor, rng: torch.Generator | None) -> Tensor:
+    def act(self, observations: Tensor, sides: Tensor, rng: torch.Generator | None) -> Tensor:
         """Actions -1..1, (batch, 2): sampled, or the mean action without random numbers."""
         with torch.no_grad():
             if rng is None:
-                mean = self.mean_actor(self.mean_encoder(observations, trails))[0].tanh()
-                return self._search(mean, observations, trails)
+                mean = self.mean_actor(self.mean_encoder(observations))[0].tanh()
+                return self._search(mean, observations, sides)
             noise = torch.randn(len(observations), ACTIONS, generator=rng).to(observations.device)
-            return self._sample(observations, trails, noise)[0]
+            return self._sample(observations, sides, noise)[0]
 
     def loss(self, batch: NavigationBatch, noise: Tensor, conservatism: float = 0.0) -> tuple[Tensor, dict[str, float]]:
         """The sum of the critics', the actor's and the temperature's loss; none has gradients in another's weights.
@@ -168,13 +120,13 @@ class Navigation(nn.Module):
         """
         temperature = self.log_temperature.exp().detach()
         targets = self.bellman_targets(batch, noise[1], temperature)
-        features = self.critics.encode(batch.observations, batch.trails)
+        features = self.critics.encode(batch.observations)
         values = self.critics(features, batch.actions)
         critic_loss = functional.mse_loss(values, targets.expand_as(values))
         if conservatism > 0:
             critic_loss = critic_loss + conservatism * self._overestimate(features, values)
 
-        actions, log_density = self._sample(batch.observations, batch.trails, noise[0], features)
+        actions, log_density = self._sample(batch.observations, batch.sides, noise[0], features)
         # Through the critics to the actions, but not into the critics.
         self.critics.requires_grad_(False)
         reached = self.critics([each.detach() for each in features], actions).amin(dim=0)
@@ -201,9 +153,8 @@ class Navigation(nn.Module):
     @torch.no_grad()
     def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:
         """R + gamma * (1 - terminal) * (min Q'(o', a') - temperature * log pi(a'|o')), (batch,)."""
-        following = (batch.next_observations, batch.next_trails)
-        actions, log_density = self._sample(*following, noise)
-        values = self.targets(self.targets.encode(*following), actions).amin(dim=0)
+        actions, log_density = self._sample(batch.next_observations, batch.next_sides, noise)
+        values = self.targets(self.targets.encode(batch.next_observations), actions).amin(dim=0)
         targets = batch.rewards + self.config.gamma * batch.continues * (values - temperature * log_density)
         return targets.clamp(-1 / (1 - self.config.gamma), 0.0) if self.config.clip_targets else targets
 
@@ -222,17 +173,17 @@ class Navigation(nn.Module):
         return encoder
 
     def _sample(
-        self, observations: Tensor, trails: Tensor, noise: Tensor, encoded: list[Tensor] | None = None
+        self, observations: Tensor, sides: Tensor, noise: Tensor, encoded: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Actions of the actor and the log-densities of what it chose, for observations that may be encoded already."""
         if self.actor_encoder is not None:
-            features = self.actor_encoder(observations, trails)
+            features = self.actor_encoder(observations)
         else:
-            features = (self.critics.encode(observations, trails) if encoded is None else encoded)[0].detach()
+            features = (self.critics.encode(observations) if encoded is None else encoded)[0].detach()
         actions, log_density = self.actor.sample(features, noise)
-        return self._search(actions, observations, trails), log_density
+        return self._search(actions, observations, sides), log_density
 
-    def _search(self, actions: Tensor, observations: Tensor, trails: Tensor) -> Tensor:
+    def _search(self, actions: Tensor, observations: Tensor, sides: Tensor) -> Tensor:
         """Actions that, where the map shows nothing to grasp, turn only to the side of the last turn.
 
         There left and right are worth nearly the same. A policy that follows the slightest difference turns to and fro
@@ -242,7 +193,7 @@ class Navigation(nn.Module):
             return actions
         nothing = observations[:, 0].flatten(1).amax(dim=1) < NOTICED
         forward, turn = actions.unbind(dim=1)
-        return torch.stack([forward, torch.where(nothing, last_sides(trails) * (1 + turn) / 2, turn)], dim=1)
+        return torch.stack([forward, torch.where(nothing, sides * (1 + turn) / 2, turn)], dim=1)
 
 
 def _follow(mean: nn.Module, module: nn.Module, rate: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from relmm.errors import ConfigError
-from relmm.features import ACTION_NAMES, IMAGE_KEY, Skill, xy_to_cell
+from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_KEY, STATE_NAMES, Skill, xy_to_cell
 from relmm.policies.relmm.navigation import from_navigation_steps
-from relmm.policies.relmm.trail import HISTORY, TRAIL_FEATURES, Trail
 
 CAPACITY = 2**15  # pictures, 30 kB each, and as many maps
 _SKILL = ACTION_NAMES.index("skill.pos")
+_MOTION = [STATE_NAMES.index(name) for name in ("x.vel", "theta.vel")]
 _PLACE = slice(ACTION_NAMES.index("skill_x.pos"), ACTION_NAMES.index("skill_y.pos") + 1)
 
 # Aligned, so that torch can take single columns.
@@ -26,7 +25,8 @@ STEP = np.dtype(
         ("frame", np.int64),
         ("next", np.int64),  # frame of the picture after it
         ("action", np.float32, 2),  # forward and turn, -1..1
-        ("trails", np.float32, (2, TRAIL_FEATURES)),  # before and after it
+        ("motion", np.float32, 2),  # by the wheels, m/s and deg/s
+        ("turns", np.float32, 2),  # of the step before it and of itself, deg/s
         ("success", bool),
         ("attempted", bool),
     ],
@@ -56,7 +56,7 @@ class Batch:
         if "next.reward" not in batch:
             raise ConfigError("The dataset has no column next.reward: train relmm from one of relmm-record or -train.")
         pictures = (batch[IMAGE_KEY] * 255).round().to(torch.uint8)  # (batch, time, 3, 100, 100)
-        actions, padded = batch["action"][:, HISTORY:].cpu(), _padding(batch, IMAGE_KEY, pictures)
+        actions, padded = batch["action"].cpu(), _padding(batch, IMAGE_KEY, pictures)
         self._frames = _frames(batch, pictures)
         self._places: dict[int, tuple[int, int]] = {}
         grasps, drives = (actions[..., _SKILL].round().numpy() == skill for skill in (Skill.GRASP, Skill.NAVIGATE))
@@ -79,7 +79,9 @@ class Batch:
         self.steps["frame"] = self._use(steps, np.zeros_like(steps))
         self.steps["next"] = self._use(steps, after)
         self.steps["action"] = from_navigation_steps(actions[steps, 0]).numpy()
-        self.steps["trails"] = _trails(batch, steps)
+        motions = batch[STATE_KEY][..., _MOTION].cpu().numpy()
+        self.steps["motion"] = motions[steps, after]
+        self.steps["turns"][:, 0], self.steps["turns"][:, 1] = motions[steps, 0, 1], motions[steps, after, 1]
         self.steps["attempted"] = own[steps, 0]
         self.pictures = {frame: pictures[row, time].cpu() for frame, (row, time) in self._places.items()}
 
@@ -146,27 +148,6 @@ def _frames(batch: dict[str, Any], pictures: Tensor) -> NDArray[np.int64]:
     checksums = pictures.flatten(2).sum(dim=2).cpu()
     numbers: Tensor = first.reshape(-1, 1).cpu() + torch.arange(time) + checksums * 2**32
     return numbers.numpy()
-
-
-def _trails(batch: dict[str, Any], rows: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Where the robot had been before and after the navigation steps in some rows, (n, 2, 21).
-
-    From the actions of the frames before; the turns of collision avoidance, which only the odometry has, are missing.
-    """
-    actions: Tensor = batch["action"]
-    known = ~_padding(batch, "action", actions)
-    features = np.empty((len(rows), 2, TRAIL_FEATURES), np.float32)
-    for row, steps, mask in zip(features, actions[rows].tolist(), known[rows].tolist(), strict=True):
-        trail = Trail()
-        for x_vel, theta_vel, skill, *_ in itertools.compress(steps[:HISTORY], mask):
-            if round(skill) == Skill.PLACE:
-                trail.reset()
-            elif round(skill) == Skill.NAVIGATE:
-                trail.moved(x_vel, theta_vel)
-        row[0] = trail.features()
-        trail.moved(*steps[HISTORY][:2])
-        row[1] = trail.features()
-    return features
 
 
 def _padding(batch: dict[str, Any], key: str, values: Tensor) -> NDArray[np.bool_]:

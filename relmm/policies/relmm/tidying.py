@@ -6,12 +6,10 @@ only a few things left, far apart: it has to know by then how to search, and tha
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from relmm.features import GRASP_X
+from relmm.features import DRIVE_PULSE_S, GRASP_X
 from relmm.policies.relmm.encoders import FloorObserver, map_places
 
 _PATCH = 0.3  # m, side of the squares of floor that are empty or are not
@@ -20,7 +18,7 @@ _KEPT = 0.3  # m from the grasp area's middle; what lies there before or after a
 
 
 def tidy(
-    maps: Tensor, next_maps: Tensor, next_trails: Tensor, empty: Tensor, rng: torch.Generator
+    maps: Tensor, next_maps: Tensor, motions: Tensor, empty: Tensor, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """The maps before and after navigation steps, without what lay on a random part of the floor.
 
@@ -29,7 +27,7 @@ def tidy(
     Args:
         maps: uint8, (batch, 4, 30, 31).
         next_maps: those after the steps.
-        next_trails: after the steps, `Trail.features`, (batch, 21).
+        motions: of each step between, m/s and deg/s, (batch, steps, 2).
         empty: share of the floor, (batch,).
         rng: chooses the squares.
 
@@ -38,8 +36,7 @@ def tidy(
     """
     device, count = maps.device, len(maps)
     here = torch.complex(*map_places()).flatten().to(device)  # forward + i * left in the robot's frame, m
-    forward, left, turn = next_trails[:, :3, None].unbind(1)
-    moved, turned = torch.complex(forward, left), torch.polar(torch.ones_like(turn), turn * math.pi)
+    moved, turned = (each[:, None] for each in _odometry(motions))
     emptied = torch.rand(count, _PATCHES**2, generator=rng).to(device) < empty[:, None]
     corners = torch.rand(2, count, 1, generator=rng).to(device) + _PATCHES // 2
 
@@ -54,5 +51,13 @@ def tidy(
         graspable = each[:, :1] * ~gone.view(count, 1, *FloorObserver.shape[1:])
         return torch.cat([graspable, each[:, 1:]], dim=1)
 
-    before = without(maps, here.expand(count, -1), here * turned + moved)
-    return before, without(next_maps, (here - moved) * turned.conj(), here.expand(count, -1))
+    before = without(maps, here.expand(count, -1), (here - moved) * turned.conj())
+    return before, without(next_maps, here * turned + moved, here.expand(count, -1))
+
+
+def _odometry(motions: Tensor) -> tuple[Tensor, Tensor]:
+    """Where steps lead, forward + i * left in m, and how far round, e^(i * angle), (batch,) each."""
+    forward, turns = motions[..., 0] * DRIVE_PULSE_S, motions[..., 1].deg2rad() * DRIVE_PULSE_S
+    headings = turns.cumsum(dim=1)
+    moved = torch.polar(forward, headings - turns / 2).sum(dim=1)
+    return moved, torch.polar(torch.ones_like(forward[:, 0]), headings[:, -1])

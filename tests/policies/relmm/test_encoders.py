@@ -11,7 +11,6 @@ from relmm.policies.relmm.configuration_relmm import NAVIGATION_ENCODERS
 from relmm.policies.relmm.encoders import Encoder, FloorObserver, Keypoints, PictureObserver, make_observer
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.grasping import GraspEnsemble
-from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 PIXEL = 7  # cells a side
 REACH = slice(1, 3), slice(15, 16)  # pixels wholly in the grasp area
@@ -136,7 +135,7 @@ def test_observation_and_features_have_the_promised_shapes(kind: str, make_confi
     assert observations.dtype == torch.uint8
     assert observations.shape == (2, *observer.shape)
     encoder = Encoder(kind)
-    assert encoder(observations, torch.zeros(2, TRAIL_FEATURES)).shape == (2, encoder.features)
+    assert encoder(observations).shape == (2, encoder.features)
 
 
 def test_paper_encoder_is_that_of_the_authors() -> None:
@@ -154,21 +153,8 @@ def test_encoder_scales_its_input_to_plus_and_minus_1() -> None:
     encoder = Encoder("floor")
     seen: list[torch.Tensor] = []
     encoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    encoder(
-        torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, *FloorObserver.shape),
-        torch.zeros(2, TRAIL_FEATURES),
-    )
+    encoder(torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, *FloorObserver.shape))
     assert [float(values.min()) for values in seen[0]] == [float(values.max()) for values in seen[0]] == [-1.0, 1.0]
-
-
-@pytest.mark.parametrize(("kind", "used"), [("floor", True), ("paper", False), ("paper_small", False)])
-def test_trail_is_a_feature_of_the_floor_only(kind: str, used: bool) -> None:
-    """The paper's navigation sees the picture alone."""
-    torch.manual_seed(0)
-    shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
-    observations, encoder = torch.zeros(1, *shape, dtype=torch.uint8), Encoder(kind)
-    left, right = (encoder(observations, torch.full((1, TRAIL_FEATURES), side)) for side in (1.0, -1.0))
-    assert torch.equal(left, right) != used
 
 
 # --- Keypoints -----------------------------------------------------------------------------------------------

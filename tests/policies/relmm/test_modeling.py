@@ -31,7 +31,6 @@ from relmm.features import (
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 from relmm.policies.relmm.navigation import NavigationBatch, from_navigation_steps, to_navigation_step
-from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
 from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
 
 CELLS = GRID**2
@@ -214,26 +213,17 @@ def test_navigation_steps_beyond_the_range_are_clipped() -> None:
     assert from_navigation_steps(steps).tolist() == [[-1.0, 1.0], [1.0, -1.0]]
 
 
-def test_policy_remembers_its_trail_from_the_drives_it_asked_for(make_policy_of, make_batch, empty) -> None:
-    """A step's velocities are in the state after it; what follows a placement is another search."""
-    policy, given = make_policy_of(seed=1, grasp_threshold=1.0), []
-    navigate = policy.navigate
-    policy.navigate = lambda pictures, trail, rng: (given.append(trail), navigate(pictures, trail, rng))[1]
-    driven, batch, expected = [(0.1, 30.0), (0.2, -60.0), (0.0, 90.0)], make_batch(empty), Trail()
-    policy.select_action(batch)
-    assert np.array_equal(given[-1], expected.features()), "what came before the first step is unknown"
-    for motion in driven:
-        batch[STATE_KEY][0, :2] = torch.tensor(motion)
-        policy.select_action(batch)
-        expected.moved(*motion)
-        assert given[-1] == pytest.approx(expected.features(), abs=1e-6)
-    policy.select_action(make_batch(empty, holding=(0,)))
-    policy.select_action(batch)
-    assert np.array_equal(given[-1], Trail().features())
-    policy.select_action(batch)
-    policy.reset()
-    policy.select_action(batch)
-    assert np.array_equal(given[-1], Trail().features())
+@pytest.mark.parametrize("theta_vel", [40.0, -40.0])
+def test_policy_knows_from_the_wheels_to_which_side_it_turned_last(
+    theta_vel, make_policy_of, make_batch, empty
+) -> None:
+    """And turns on to that side, where nothing is in view."""
+    policy, batch = (
+        make_policy_of(seed=1, grasp_threshold=1.0, grasp_initial_spread=0.0, grasp_initial_logit=-9.0),
+        make_batch(empty),
+    )
+    batch[STATE_KEY][0, :2] = torch.tensor([0.1, theta_vel])
+    assert policy.select_action(batch)[0, 1].sign() == math.copysign(1, theta_vel)
 
 
 # --- Seeds, files and LeRobot --------------------------------------------------------------------------------
@@ -298,19 +288,16 @@ def test_steps_without_success_are_rewarded_with_the_grasp_probability(
     relabel: bool, terminal: bool, failed: bool, rewards, continues, make_policy_of: MakePolicy
 ) -> None:
     policy = make_policy_of("dense", relabel=relabel, relabel_terminal=terminal, relabel_failed=failed)
-    pictures = torch.zeros(4, 1, 1, 1, dtype=torch.uint8)
-    success, attempted = torch.tensor([0.0, 0.0, 1.0, 0.0]), torch.tensor([False, False, True, True])
-    still, trails = torch.zeros(4, 2), torch.zeros(4, TRAIL_FEATURES)
-    batch = NavigationBatch(pictures, trails, still, success - 1, pictures, trails, 1 - success)
-    result = policy.relabel(batch, torch.tensor([0.3, 0.0, 0.9, 0.4]), success > 0.5, attempted)
-    assert result.rewards.tolist() == pytest.approx(rewards)
-    assert result.continues.tolist() == pytest.approx(continues)
-    assert batch.rewards.tolist() == [-1, -1, 0, -1], "what was given is left as it is"
+    success, attempted = torch.tensor([False, False, True, False]), torch.tensor([False, False, True, True])
+    result = policy.rewards(torch.tensor([0.3, 0.0, 0.9, 0.4]), success, attempted)
+    assert result[0].tolist() == pytest.approx(rewards)
+    assert result[1].tolist() == pytest.approx(continues)
 
 
 # --- Learning from LeRobot's batches -------------------------------------------------------------------------
 Frame = tuple[NDArray[np.uint8], dict[str, float], float]  # picture, action, reward
 DRIVE = action_dict(x_vel=0.3, theta_vel=-40.0)
+DRIVEN = (0.28, -37.0)  # by the wheels, m/s and deg/s
 
 
 def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> dict[str, Tensor]:
@@ -321,12 +308,16 @@ def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> di
         rows = [[episode[min(max(index, 0), len(episode) - 1)] for index in row] for row in wanted]
         return rows, torch.tensor([[not 0 <= index < len(episode) for index in row] for row in wanted])
 
-    rows, padded = look(policy.config.observation_delta_indices)
+    deltas = policy.config.observation_delta_indices
+    rows, padded = look(deltas)
     action_rows, action_padded = look(policy.config.action_delta_indices)
     return {
         IMAGE_KEY: torch.from_numpy(np.stack([[f[0] for f in row] for row in rows])).permute(0, 1, 4, 2, 3) / 255,
         "action": torch.tensor([[[f[1][name] for name in ACTION_NAMES] for f in row] for row in action_rows]),
         "next.reward": torch.tensor([row[0][2] for row in rows]),
+        STATE_KEY: torch.tensor(
+            [[[*(DRIVEN if delta > 0 else (0.1, 20.0)), *[0.0] * 8] for delta in deltas] for _ in frames]
+        ),
         "index": torch.tensor(frames),
         f"{IMAGE_KEY}_is_pad": padded,
         "action_is_pad": action_padded,
@@ -352,16 +343,15 @@ def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, succes
     attempted = episode[1][1]["skill.pos"] == Skill.GRASP
     chance = 0.0 if attempted else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
     observations = policy.observer(pictures, policy.grasping)
-    trail = Trail()
-    trail.moved(DRIVE["x.vel"], DRIVE["theta.vel"])
     return NavigationBatch(
         observations[:1],
-        torch.zeros(1, TRAIL_FEATURES),
+        torch.ones(1),
         from_navigation_steps(torch.tensor([list(DRIVE.values())])),
         torch.tensor([0.0 if success else chance - 1]),
         observations[1:],
-        torch.from_numpy(trail.features()[None]),
+        -torch.ones(1),
         torch.tensor([0.0 if success else 1 - chance]),
+        torch.tensor([[DRIVEN]]),
     )
 
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -12,11 +11,10 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 from relmm.policies.relmm.encoders import Encoder, FloorObserver, PictureObserver
 from relmm.policies.relmm.navigation import Actor, Navigation, NavigationBatch
-from relmm.policies.relmm.trail import TRAIL_FEATURES
 
 SIZE = 5
 KINDS = ["floor", "paper_small"]
-Seen = tuple[Tensor, Tensor]  # an observation and the trail to it
+Seen = tuple[Tensor, Tensor]  # an observation and the side of the last turn
 MakeNavigation = Callable[..., Navigation]
 
 
@@ -29,12 +27,12 @@ class DoubleEncoder(Encoder):
         if encoder.on_floor:
             self.keypoints, self.embed = encoder.keypoints, encoder.embed
 
-    def forward(self, observations: Tensor, trails: Tensor) -> Tensor:
+    def forward(self, observations: Tensor) -> Tensor:
         scaled = observations.double() / 127.5 - 1
         encoded = self.layers(scaled)
         if not self.on_floor:
             return encoded
-        return torch.cat([encoded, self.embed(torch.cat([self.keypoints(scaled), trails], dim=1))], dim=1)
+        return torch.cat([encoded, self.embed(self.keypoints(scaled))], dim=1)
 
 
 @pytest.fixture
@@ -61,10 +59,11 @@ def make_batch(kind: str = "floor") -> NavigationBatch:
     shape = FloorObserver.shape if kind == "floor" else PictureObserver.shape
     observations, following = torch.randint(0, 256, (2, SIZE, *shape), dtype=torch.uint8, generator=rng)
     actions = torch.rand(SIZE, 2, dtype=torch.double, generator=rng) * 2 - 1
-    trails, next_trails = torch.rand(2, SIZE, TRAIL_FEATURES, dtype=torch.double, generator=rng) * 2 - 1
+    sides, next_sides = torch.tensor([[1, -1, 1, -1, 1], [-1, -1, 1, 1, 1]]).double()
+    motions = torch.rand(SIZE, 3, 2, dtype=torch.double, generator=rng) - 0.5
     rewards = torch.tensor([-1.0, 0.0, -0.4, -1.0, -0.9], dtype=torch.double)
     continues = torch.tensor([1, 0, 0.6, 1, 1.0]).double()
-    return NavigationBatch(observations, trails, actions, rewards, following, next_trails, continues)
+    return NavigationBatch(observations, sides, actions, rewards, following, next_sides, continues, motions)
 
 
 def make_noise() -> Tensor:
@@ -72,18 +71,18 @@ def make_noise() -> Tensor:
 
 
 def before(batch: NavigationBatch) -> Seen:
-    return batch.observations, batch.trails
+    return batch.observations, batch.sides
 
 
 def after(batch: NavigationBatch) -> Seen:
-    return batch.next_observations, batch.next_trails
+    return batch.next_observations, batch.next_sides
 
 
 # --- The same in other words ---------------------------------------------------------------------------------
-def policy_at(navigation: Navigation, *seen: Tensor) -> Independent:
+def policy_at(navigation: Navigation, observations: Tensor, _: Tensor) -> Independent:
     """The actor's distribution before the tanh."""
     encoder = navigation.actor_encoder or navigation.critics.encoders[0]
-    outputs = navigation.actor.net(encoder(*seen))
+    outputs = navigation.actor.net(encoder(observations))
     log_std = outputs[:, 2:]
     if navigation.actor_encoder is None:
         log_std = log_std.clamp(-5, 2)
@@ -99,7 +98,7 @@ def act_at(navigation: Navigation, seen: Seen, noise: Tensor) -> tuple[Tensor, T
 def values_at(critics: Any, seen: Seen, actions: Tensor) -> list[Tensor]:
     encoders = list(critics.encoders) * (2 // len(critics.encoders))
     return [
-        head(torch.cat([encoder(*seen), actions], dim=1))[:, 0]
+        head(torch.cat([encoder(seen[0]), actions], dim=1))[:, 0]
         for head, encoder in zip(critics.heads, encoders, strict=True)
     ]
 
@@ -167,7 +166,7 @@ def test_conservatism_adds_what_uniform_actions_seem_better_by(kind: str, make_n
     loss = navigation.loss(batch, noise, conservatism=0.7)[0].item()
     torch.manual_seed(5)
     critics = navigation.critics
-    features = critics.encode(batch.observations, batch.trails)
+    features = critics.encode(batch.observations)
     others = torch.stack([critics(features, actions) for actions in torch.rand(10, SIZE, 2) * 2 - 1])
     gap = others.exp().mean(dim=0).log() - critics(features, batch.actions)
     assert loss - plain == pytest.approx(0.7 * gap.mean().item())
@@ -293,10 +292,10 @@ def test_deviation_is_limited_for_the_floor_only(kind: str, expected: tuple[floa
 @pytest.mark.parametrize("kind", KINDS)
 def test_greedy_action_is_the_mean_and_sampled_ones_follow_the_actor(kind: str, make_navigation) -> None:
     navigation = make_navigation(kind)
-    observations, trails = (column[:1] for column in before(make_batch(kind)))
-    gaussian = policy_at(navigation, observations, trails).base_dist
-    assert torch.allclose(navigation.act(observations, trails, None), gaussian.loc.tanh())
-    many = observations.expand(200, -1, -1, -1), trails.expand(200, -1)
+    observations, sides = (column[:1] for column in before(make_batch(kind)))
+    gaussian = policy_at(navigation, observations, sides).base_dist
+    assert torch.allclose(navigation.act(observations, sides, None), gaussian.loc.tanh())
+    many = observations.expand(200, -1, -1, -1), sides.expand(200)
     raw = navigation.act(*many, torch.Generator().manual_seed(0)).atanh()
     assert torch.allclose(raw.mean(dim=0), gaussian.loc[0], atol=4 * gaussian.scale.max().item() / math.sqrt(200))
     assert torch.allclose(raw.std(dim=0), gaussian.scale[0], rtol=0.2)
@@ -335,11 +334,10 @@ def test_average_over_nothing_is_the_actor_itself(kind: str, make_navigation) ->
 
 
 # --- Search --------------------------------------------------------------------------------------------------
-def with_turns(batch: NavigationBatch, turns: list[float], graspability: int) -> NavigationBatch:
-    """The batch after turns to the left, with nothing better to grasp than this."""
+def with_best(batch: NavigationBatch, graspability: int) -> NavigationBatch:
+    """The batch with nothing better to grasp than this."""
     batch.observations[:, 0] = batch.observations[:, 0].clamp(max=graspability)
     batch.observations[:, 0, 4, 7] = graspability
-    batch.trails[:, 2] = -torch.tensor(turns).double()
     return batch
 
 
@@ -347,9 +345,8 @@ def with_turns(batch: NavigationBatch, turns: list[float], graspability: int) ->
 @pytest.mark.parametrize("sample", [True, False])
 def test_where_nothing_is_in_view_the_robot_turns_on(graspability, keep, bound, sample, make_navigation) -> None:
     """Greedily and sampled; forward, and the order of the turns, are left as they are."""
-    turns = [0.1, -0.1, 0.2, -0.01, 0.0]
     free, kept = (make_navigation(orderly_search=on) for on in (False, keep))
-    seen = before(with_turns(make_batch(), turns, graspability))
+    seen = before(with_best(make_batch(), graspability))
     wanted, actions = (n.act(*seen, torch.Generator().manual_seed(0) if sample else None) for n in (free, kept))
     assert torch.equal(actions[:, 0], wanted[:, 0])
     sides = torch.tensor([1, -1, 1, -1, 1]).double()
@@ -359,8 +356,8 @@ def test_where_nothing_is_in_view_the_robot_turns_on(graspability, keep, bound, 
 def test_actor_learns_by_the_turns_that_are_made(make_navigation: MakeNavigation) -> None:
     """Its loss is that of the kept turns, at this observation and, in the targets, at the next."""
     navigation, noise = make_navigation(clip_targets=False), make_noise()
-    batch = with_turns(make_batch(), [0.1, -0.1, 0.2, -0.01, 0.0], 30)
-    batch.next_observations, batch.next_trails = batch.observations, batch.trails
+    batch = with_best(make_batch(), 30)
+    batch.next_observations, batch.next_sides = batch.observations, batch.sides
     sides = torch.tensor([1, -1, 1, -1, 1]).double()
     made = []
     for each in noise:
@@ -374,25 +371,3 @@ def test_actor_learns_by_the_turns_that_are_made(make_navigation: MakeNavigation
     value = torch.minimum(first, second) - 0.1 * next_density
     targets = navigation.bellman_targets(batch, noise[1], torch.tensor(0.1, dtype=torch.double))
     assert torch.allclose(targets, batch.rewards + navigation.config.gamma * batch.continues * value)
-
-
-# --- Mirror --------------------------------------------------------------------------------------------------
-def test_mirrored_batch_exchanges_left_and_right_and_nothing_else() -> None:
-    batch = make_batch()
-    mirrored = batch.mirrored()
-    assert torch.equal(mirrored.observations[..., 0], batch.observations[..., -1])
-    assert torch.equal(mirrored.next_observations.flip(-1), batch.next_observations)
-    assert torch.equal(mirrored.actions[:, 0], batch.actions[:, 0])
-    assert torch.equal(mirrored.actions[:, 1], -batch.actions[:, 1])
-    for turned, straight in ((mirrored.trails, batch.trails), (mirrored.next_trails, batch.next_trails)):
-        assert torch.equal(turned[:, 0::3], straight[:, 0::3])
-        assert torch.equal(turned[:, 1::3], -straight[:, 1::3])
-        assert torch.equal(turned[:, 2::3], -straight[:, 2::3])
-    assert mirrored.rewards is batch.rewards
-    assert mirrored.continues is batch.continues
-
-
-def test_batch_mirrored_twice_is_the_batch() -> None:
-    batch = make_batch()
-    twice = batch.mirrored().mirrored()
-    assert all(torch.equal(getattr(twice, each.name), getattr(batch, each.name)) for each in fields(batch))

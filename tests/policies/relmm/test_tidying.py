@@ -7,10 +7,9 @@ import torch
 from torch import Tensor
 
 from relmm.features import DRIVE_PULSE_S, GRASP_X, MAX_THETA_VEL
+from relmm.policies.relmm.batch import NavigationBatch
 from relmm.policies.relmm.encoders import FloorObserver, map_places
-from relmm.policies.relmm.navigation import NavigationBatch
 from relmm.policies.relmm.tidying import tidy
-from relmm.policies.relmm.trail import TRAIL_FEATURES, Trail
 
 COUNT = 400
 STEPS = [(0.0, 0.0), (0.44, 0.0), (0.0, MAX_THETA_VEL), (0.3, -80.0), (0.44, 60.0)]  # m/s and deg/s
@@ -20,11 +19,8 @@ def maps(count: int = COUNT) -> Tensor:
     return torch.full((count, *FloorObserver.shape), 200, dtype=torch.uint8)
 
 
-def trails(x_vel: float, theta_vel: float, count: int = COUNT) -> Tensor:
-    trail = Trail()
-    trail.moved(0.2, 30.0)
-    trail.moved(x_vel, theta_vel)
-    return torch.from_numpy(trail.features()).expand(count, -1)
+def motions(*steps: tuple[float, float], count: int = COUNT) -> Tensor:
+    return torch.tensor(steps).expand(count, -1, -1)
 
 
 def pixel_of(forward: float, left: float) -> tuple[int, int] | None:
@@ -39,7 +35,7 @@ def pixel_of(forward: float, left: float) -> tuple[int, int] | None:
 def test_what_is_gone_before_a_step_is_gone_after_it(x_vel: float, theta_vel: float) -> None:
     """Where the same place of the floor is, comes from how the robot moves: along an arc of 0.24 s."""
     generator = torch.Generator().manual_seed(0)
-    before, after = tidy(maps(), maps(), trails(x_vel, theta_vel), torch.full((COUNT,), 0.5), generator)
+    before, after = tidy(maps(), maps(), motions((x_vel, theta_vel)), torch.full((COUNT,), 0.5), generator)
     turn, length = math.radians(theta_vel) * DRIVE_PULSE_S, x_vel * DRIVE_PULSE_S
     robot = (length * math.cos(turn / 2), length * math.sin(turn / 2))
     compared = differing = 0
@@ -55,10 +51,25 @@ def test_what_is_gone_before_a_step_is_gone_after_it(x_vel: float, theta_vel: fl
     assert differing / compared < 0.15, "but for places at the edge of a square; by chance it would be half"
 
 
+def test_several_steps_lead_where_they_lead_one_after_the_other() -> None:
+    """Around a square, by quarter turns: back to where it began; a step that is not there changes nothing."""
+    quarter = 90 / DRIVE_PULSE_S
+    for steps in ([(0.4, 0.0), (0.0, quarter)] * 4, [(0.0, 0.0)]):
+        before, after = tidy(
+            maps(), maps(), motions(*steps), torch.full((COUNT,), 0.5), torch.Generator().manual_seed(4)
+        )
+        assert (before != after).float().mean() < 0.01, "but for rounding at the edges of squares"
+    straight = [motions((0.3, 0.0), (0.4, 0.0), (0.0, 0.0)), motions((0.7, 0.0))]
+    results = [
+        tidy(maps(), maps(), each, torch.full((COUNT,), 0.5), torch.Generator().manual_seed(5)) for each in straight
+    ]
+    assert all((one != other).float().mean() < 0.01 for one, other in zip(*results, strict=True))
+
+
 @pytest.mark.parametrize("empty", [0.0, 0.3, 1.0])
 def test_share_of_the_floor_is_emptied_and_colours_stay(empty: float) -> None:
     generator = torch.Generator().manual_seed(1)
-    before, after = tidy(maps(), maps(), trails(0.2, 40.0), torch.full((COUNT,), empty), generator)
+    before, after = tidy(maps(), maps(), motions((0.2, 40.0)), torch.full((COUNT,), empty), generator)
     far = torch.hypot(map_places()[0] - sum(GRASP_X) / 2, map_places()[1]) > 0.6
     for each in (before, after):
         assert (each[:, 0, far] == 0).float().mean().item() == pytest.approx(empty, abs=0.03)
@@ -70,7 +81,7 @@ def test_share_of_the_floor_is_emptied_and_colours_stay(empty: float) -> None:
 def test_what_may_have_been_grasped_stays(x_vel: float, theta_vel: float) -> None:
     """What lies in the grasp area after the step was somewhere before it, and is there, too."""
     generator = torch.Generator().manual_seed(2)
-    before, after = tidy(maps(), maps(), trails(x_vel, theta_vel), torch.ones(COUNT), generator)
+    before, after = tidy(maps(), maps(), motions((x_vel, theta_vel)), torch.ones(COUNT), generator)
     turn, length = math.radians(theta_vel) * DRIVE_PULSE_S, x_vel * DRIVE_PULSE_S
     x, y = length * math.cos(turn / 2), length * math.sin(turn / 2)
     for forward in GRASP_X:
@@ -85,7 +96,9 @@ def test_what_may_have_been_grasped_stays(x_vel: float, theta_vel: float) -> Non
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_share_of_the_steps_is_tidied(share: float) -> None:
     numbers = torch.zeros(COUNT)
-    batch = NavigationBatch(maps(), trails(0, 0), torch.zeros(COUNT, 2), numbers, maps(), trails(0.1, 0.0), numbers)
+    batch = NavigationBatch(
+        maps(), numbers, torch.zeros(COUNT, 2), numbers, maps(), numbers, numbers, motions((0.1, 0.0))
+    )
     tidied = batch.tidied(share, torch.Generator().manual_seed(3))
     touched = (tidied.observations[:, 0] == 0).flatten(1).any(dim=1)
     assert touched.float().mean().item() == pytest.approx(share, abs=0.08)
@@ -94,4 +107,3 @@ def test_share_of_the_steps_is_tidied(share: float) -> None:
     assert bare.float().mean().item() == pytest.approx(share / 5, abs=0.06), "everything far is gone"
     assert tidied.rewards is batch.rewards
     assert tidied.actions is batch.actions
-    assert tidied.next_trails.shape == (COUNT, TRAIL_FEATURES)

@@ -1,0 +1,84 @@
+"""A batch of navigation steps, what it might have been as well, and what n steps are worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from relmm.policies.relmm.tidying import tidy
+
+_NOT_ALL = 0.8  # share of the steps with a tidied floor in which something is left
+
+
+@dataclass
+class NavigationBatch:
+    """Navigation steps to learn from, or several in a row: from an action to where the last one led.
+
+    Attributes:
+        observations, next_observations: uint8, (batch, channels, height, width).
+        sides, next_sides: to which the robot had turned last, 1 for the left and -1 for the right, (batch,).
+        actions: -1..1, (batch, 2).
+        rewards: -1..0 for one step, (batch,).
+        continues: what the next observation's value counts, but for one factor gamma: 1 where the search goes on, 0
+            after a success, or the probability of that, (batch,).
+        motions: of each step by the wheels, m/s and deg/s, 0 where there is none, (batch, steps, 2).
+    """
+
+    observations: Tensor
+    sides: Tensor
+    actions: Tensor
+    rewards: Tensor
+    next_observations: Tensor
+    next_sides: Tensor
+    continues: Tensor
+    motions: Tensor
+
+    def mirrored(self) -> NavigationBatch:
+        """The same with left and right exchanged; for maps of the floor, whose columns are symmetric."""
+        sign = torch.tensor([1.0, -1.0], device=self.actions.device)
+        return replace(
+            self,
+            observations=self.observations.flip(-1),
+            sides=-self.sides,
+            actions=self.actions * sign,
+            next_observations=self.next_observations.flip(-1),
+            next_sides=-self.next_sides,
+            motions=self.motions * sign,
+        )
+
+    def tidied(self, share: float, rng: torch.Generator) -> NavigationBatch:
+        """The same, but in a share of the steps part of what lay about is gone; for maps of the floor.
+
+        How much, is uniform, as it is over the time in which a room is tidied; in a fifth of them it is everything.
+        """
+        count = len(self.rewards)
+        empty = torch.rand(count, generator=rng) / _NOT_ALL
+        empty[torch.rand(count, generator=rng) >= share] = 0.0
+        empty = empty.to(self.rewards.device)
+        before, after = tidy(self.observations, self.next_observations, self.motions, empty, rng)
+        return replace(self, observations=before, next_observations=after)
+
+
+def last_sides(theta_vels: Tensor) -> Tensor:
+    """To which side turns at these velocities go, 1 for the left and -1 for the right."""
+    return torch.where(theta_vels >= 0, 1.0, -1.0)
+
+
+def n_step(rewards: Tensor, continues: Tensor, lengths: Tensor, gamma: float) -> tuple[Tensor, Tensor]:
+    """Several steps as one: far rewards are learned from in fewer updates (Sutton & Barto 2018, 7.1).
+
+    Args:
+        rewards: of each step, (batch, n).
+        continues: probability that the search goes on after it, (batch, n).
+        lengths: how many steps there are, 1 to n, (batch,).
+        gamma: discount of a step.
+
+    Returns:
+        `NavigationBatch.rewards` and `NavigationBatch.continues`.
+    """
+    there = torch.arange(rewards.shape[1], device=rewards.device) < lengths[:, None]
+    discounts = torch.where(there, gamma * continues, 1.0).cumprod(dim=1)
+    before = torch.cat([torch.ones_like(discounts[:, :1]), discounts[:, :-1]], dim=1)
+    return (before * torch.where(there, rewards, 0.0)).sum(dim=1), discounts[:, -1] / gamma
