@@ -24,6 +24,7 @@ from relmm.features import Phase, Skill, cell_to_xy
 from relmm.learning.learner import Learner
 from relmm.learning.replay import Replay
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.policies.relmm.searching import Search
 
 OUTPUT = Path(__file__).parent / "results" / "update_speed.csv"
 FRAMES = 600
@@ -70,7 +71,9 @@ def measure(preset: str, repeats: int) -> dict[str, object]:
     row = {
         "navigation_update_ms": milliseconds(update_navigation, repeats),
         "grasp_update_ms": milliseconds(lambda: learner.update_grasping(Phase.LEARNING), repeats),
-        "decision_ms": milliseconds(lambda: (policy.look(pictures), policy.navigate(pictures, 0.0, None)), repeats),
+        "decision_ms": milliseconds(
+            lambda: (policy.look(pictures), policy.navigate(pictures, 0.0, Search(), None)), repeats
+        ),
     }
     batches = {"navigation_batch": config.navigation_batch_size, "grasp_batch": config.grasp_batch_size}
     parameters = sum(weight.numel() for weight in policy.parameters() if weight.requires_grad)

@@ -16,6 +16,7 @@ from relmm.learning.pseudo_reset import pseudo_reset
 from relmm.policies.controller import drive_anywhere, grasp_cell
 from relmm.policies.relmm.grasping import Estimate
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.policies.relmm.searching import Search
 
 # Where a curriculum puts an object down again: inside the grasp area by the width of an object.
 _DROP_X, _DROP_Y = (0.315, 0.45), (-0.065, 0.065)  # m
@@ -55,6 +56,7 @@ class Trainer:
         self._stationary = curriculum == "stationary"
         num_max = config.num_max if curriculum == "autonomous" else 0
         self._autonomous = AutonomousCurriculum(config.num_start, config.num_stop, num_max)
+        self._search = Search()
         policy.sampling = True
 
     # --- Algorithm 1, stationary --------------------------------------------------------------------------
@@ -127,7 +129,7 @@ class Trainer:
     def _navigation_action(self) -> dict[str, float]:
         if self.progress.steps < self.config.random_steps:
             return drive_anywhere(self._rng)
-        return self.policy.navigate(self._pictures(), self.life.observation["theta.vel"], self.policy.rng)
+        return self.policy.navigate(self._pictures(), self.life.observation["theta.vel"], self._search, self.policy.rng)
 
     def _pseudo_reset(self) -> None:
         for action in pseudo_reset(self._rng, self._pseudo_reset_steps, lambda: self.life.holding):

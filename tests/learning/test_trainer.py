@@ -16,6 +16,7 @@ from relmm.learning.life import Life
 from relmm.learning.progress import Progress
 from relmm.learning.trainer import Trainer
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.relmm.searching import Search
 
 PSEUDO_RESET_STEPS = 3
 TURN_ROUND_STEPS, TURN_AWAY_STEPS = 6, 4  # of a pseudo-reset, before and after the placement
@@ -106,7 +107,7 @@ class FakePolicy:
     def look(self, image: np.ndarray) -> None:
         self.grasp_probability = 1.0 if image.max() else self.floor_probability
 
-    def navigate(self, image: np.ndarray, theta_vel: float, rng: object) -> dict[str, float]:
+    def navigate(self, image: np.ndarray, theta_vel: float, search: Search, rng: object) -> dict[str, float]:
         return POLICY_DRIVE
 
 

@@ -53,7 +53,8 @@ class ReLMMConfig(ControllerConfig):
 
         navigation_encoder: `floor` (map of the floor with grasp probabilities), `paper` or `paper_small` (pictures).
         navigation_hidden: width of the dense layers.
-        orderly_search: where the map shows nothing to grasp, turn only to the side of the last turn.
+        orderly_search: where the map shows nothing to grasp, turn only to the side of the last turn, and after a full
+            turn drive 1.3 m straight on.
         relabel: reward steps without success with the current P[grasp] - 1 instead of -1.
         relabel_failed: also those whose attempts have failed. The ensemble sees what lies there, not the wall behind it
             that keeps the arm away: a step that is rewarded against the evidence is taken for ever.

@@ -19,6 +19,7 @@ from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm.maps import Maps
 from relmm.policies.relmm.navigation import ACTIONS, Navigation, to_navigation_step
 from relmm.policies.relmm.offline import CAPACITY, Batch, Recollection, Rows
+from relmm.policies.relmm.searching import Search
 
 _TURN = STATE_NAMES.index("theta.vel")
 
@@ -58,7 +59,7 @@ class ReLMMPolicy(ControllerPolicy):
         rng = self._rng_of(row) if self.sampling else None
         if row.attempts < self.config.num_grasp and self._wants_to_grasp(estimate, row.attempts, rng):
             return self.grasp(estimate, rng)
-        return self.navigate(pictures, float(state[_TURN]), rng)
+        return self.navigate(pictures, float(state[_TURN]), row.memory.setdefault("search", Search()), rng)
 
     def look(self, pictures: Tensor) -> Estimate:
         """The ensemble's opinion of pictures 0..1 (batch, 3, 100, 100), which is also remembered."""
@@ -75,15 +76,20 @@ class ReLMMPolicy(ControllerPolicy):
         cells = estimate.mean.argmax(dim=1) if rng is None else self.grasping.sample(estimate, rng)
         return grasp_cell(int(cells[0]))
 
-    def navigate(self, pictures: Tensor, theta_vel: float, rng: torch.Generator | None) -> dict[str, float]:
+    def navigate(
+        self, pictures: Tensor, theta_vel: float, search: Search, rng: torch.Generator | None
+    ) -> dict[str, float]:
         """A navigation step: sampled, or the mean action without random numbers.
 
         Args:
             pictures: one, 0..1, (1, 3, 100, 100).
             theta_vel: of the last navigation step, deg/s.
+            search: what the robot has seen since its last one.
             rng: to sample with.
         """
         observations = self.observer(pictures, self.grasping)
+        if self.navigation.is_orderly and search.leaves(bool(self.navigation.in_view(observations)), theta_vel):
+            return to_navigation_step([1.0, 0.0])
         sides = last_sides(torch.tensor([theta_vel], device=self.weights_device))
         action = self.navigation.act(observations, sides, rng)[0]
         return to_navigation_step(action.tolist())

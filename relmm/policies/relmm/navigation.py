@@ -166,6 +166,15 @@ class Navigation(nn.Module):
         _follow(self.mean_encoder, self._encoder, self.config.actor_tau)
 
     @property
+    def is_orderly(self) -> bool:
+        """Whether there are rules for where to turn while nothing is in view."""
+        return self.config.orderly_search and self.config.navigation_encoder == "floor"
+
+    def in_view(self, observations: Tensor) -> Tensor:
+        """On which maps there is something to grasp, bool, (batch,)."""
+        return observations[:, 0].flatten(1).amax(dim=1) >= NOTICED
+
+    @property
     def _encoder(self) -> Encoder:
         """The actor's."""
         encoder = self.actor_encoder or self.critics.encoders[0]
@@ -189,11 +198,10 @@ class Navigation(nn.Module):
         There left and right are worth nearly the same. A policy that follows the slightest difference turns to and fro
         before a bare wall for ever.
         """
-        if not (self.config.orderly_search and self.config.navigation_encoder == "floor"):
+        if not self.is_orderly:
             return actions
-        nothing = observations[:, 0].flatten(1).amax(dim=1) < NOTICED
         forward, turn = actions.unbind(dim=1)
-        return torch.stack([forward, torch.where(nothing, sides * (1 + turn) / 2, turn)], dim=1)
+        return torch.stack([forward, torch.where(self.in_view(observations), turn, sides * (1 + turn) / 2)], dim=1)
 
 
 def _follow(mean: nn.Module, module: nn.Module, rate: float) -> None:

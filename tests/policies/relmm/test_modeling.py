@@ -226,6 +226,17 @@ def test_policy_knows_from_the_wheels_to_which_side_it_turned_last(
     assert policy.select_action(batch)[0, 1].sign() == math.copysign(1, theta_vel)
 
 
+@pytest.mark.parametrize(("orderly", "straight"), [(True, True), (False, False)])
+def test_policy_goes_elsewhere_after_a_look_all_round(orderly, straight, make_policy_of, make_batch, empty) -> None:
+    nothing = {"grasp_threshold": 1.0, "grasp_initial_spread": 0.0, "grasp_initial_logit": -9.0}
+    policy, batch = make_policy_of(seed=1, orderly_search=orderly, **nothing), make_batch(empty)
+    batch[STATE_KEY][0, 1] = MAX_THETA_VEL
+    actions = [policy.select_action(batch)[0, :2].tolist() for _ in range(27)]
+    assert any(action == pytest.approx([MAX_X_VEL, 0.0]) for action in actions) == straight
+    policy.reset()
+    assert [policy.select_action(batch)[0, :2].tolist() for _ in range(27)] == actions, "a new episode, a new search"
+
+
 # --- Seeds, files and LeRobot --------------------------------------------------------------------------------
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_equal_seeds_give_equal_weights_and_leave_global_random_numbers_alone(backbone, make_policy_of) -> None:
