@@ -2,7 +2,7 @@
 
 PYTHON ?= python3
 JOBS ?= 2
-DEMO_STEPS ?= 2000
+DEMO_STEPS ?= 1000
 DEMO_DIR ?= outputs/demo/$(shell date +%Y-%m-%d_%H-%M-%S)
 DEMO_DIR := $(DEMO_DIR)# expanded once: every step of the demo uses the same folder
 
@@ -32,7 +32,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python $(PIP_INSTALL) -c constraints.txt -e '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (15 minutes)
+demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (10 minutes)
 	$(BIN)/relmm-train --robot.type=locobot_sim --robot.room=no_obstacles --dataset.repo_id=demo/no_obstacles \
 	  --steps=$(DEMO_STEPS) --seed=0 --output_dir=$(DEMO_DIR)/train
 # An untrained robot grasps at everything: 40 navigation steps of that are enough to see.
