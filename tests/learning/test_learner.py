@@ -320,6 +320,7 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
         "background_weight": 0.0,
         "conservative_weight": 0.0,
         "mirror": False,
+        "recolour": False,
         "tidied_share": 0.0,
     }
     policy = make_policy(refreshed_maps=0, **alone, seed=2)

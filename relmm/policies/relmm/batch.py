@@ -9,6 +9,7 @@ from torch import Tensor
 
 from relmm.policies.relmm.tidying import tidy
 
+_GAIN, _OFFSET, _NOISE = 0.4, 30.0, 20.0  # colours may be brighter or darker by, of 1, and of 255
 _NOT_ALL = 0.8  # share of the steps with a tidied floor in which something is left
 
 
@@ -59,6 +60,27 @@ class NavigationBatch:
         empty = empty.to(self.rewards.device)
         before, after = tidy(self.observations, self.next_observations, self.motions, empty, rng)
         return replace(self, observations=before, next_observations=after)
+
+    def recoloured(self, rng: torch.Generator) -> NavigationBatch:
+        """The same in another light, both maps in the same; for maps of the floor.
+
+        There are few pictures, and each is learned from a hundred times. A network that knows them again by their
+        colours remembers what came of them, instead of learning what lies where.
+        """
+        device, count = self.rewards.device, len(self.rewards)
+        gain = 1 + _GAIN * _plus_minus_1((count, 3, 1, 1), rng)
+        offset = _OFFSET * _plus_minus_1((count, 3, 1, 1), rng)
+
+        def other(maps: Tensor) -> Tensor:
+            noise = _NOISE * _plus_minus_1((count, 3, *maps.shape[2:]), rng)
+            colours = maps[:, 1:] * gain.to(device) + (offset + noise).to(device)
+            return torch.cat([maps[:, :1], colours.clamp(0, 255).to(torch.uint8)], dim=1)
+
+        return replace(self, observations=other(self.observations), next_observations=other(self.next_observations))
+
+
+def _plus_minus_1(shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
+    return torch.rand(shape, generator=rng) * 2 - 1
 
 
 def last_sides(theta_vels: Tensor) -> Tensor:

@@ -73,6 +73,7 @@ class ReLMMConfig(ControllerConfig):
         clip_targets: keep Bellman targets within what rewards of -1 to 0 allow.
         conservative_weight: of conservative Q-learning in `forward`, that is, when LeRobot trains from a dataset alone.
         mirror: learn from mirrored maps of the floor, too.
+        recolour: learn from maps of the floor in another light each time.
         tidied_share: of a batch of maps of the floor, in which part of what lay about is gone, to learn how to finish.
         refreshed_maps: frames per update whose stored grasp map and P[grasp] are computed anew by the current ensemble,
             the most outdated of the batch first; 0 for the whole batch.
@@ -129,6 +130,7 @@ class ReLMMConfig(ControllerConfig):
     clip_targets: bool = True
     conservative_weight: float = 0.5
     mirror: bool = True
+    recolour: bool = True
     tidied_share: float = 0.5
     refreshed_maps: int = 6
 

@@ -209,11 +209,15 @@ class ReLMMPolicy(ControllerPolicy):
         return rewards + chance, continues * (1 - chance) if self.config.relabel_terminal else continues
 
     def augmented(self, batch: NavigationBatch, rng: torch.Generator) -> NavigationBatch:
-        """Navigation steps as they might have been as well: see `mirror` and `tidied_share`."""
+        """Navigation steps as they might have been as well: see `mirror`, `recolour` and `tidied_share`."""
         if self.config.mirror and torch.rand(1, generator=rng) < 0.5:
             batch = batch.mirrored()
-        tidied = self.config.tidied_share > 0 and self.config.navigation_encoder == "floor"
-        return batch.tidied(self.config.tidied_share, rng) if tidied else batch
+        if self.config.navigation_encoder == "floor":
+            if self.config.recolour:
+                batch = batch.recoloured(rng)
+            if self.config.tidied_share > 0:
+                batch = batch.tidied(self.config.tidied_share, rng)
+        return batch
 
     def _navigation_batch(self, steps: Rows, find: Callable[[NDArray[np.int64]], Tensor]) -> NavigationBatch:
         """Steps of `offline.STEP` with what the ensemble makes of their pictures, relabelled."""

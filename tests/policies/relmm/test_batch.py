@@ -41,6 +41,23 @@ def test_batch_mirrored_twice_is_the_batch() -> None:
     assert all(torch.equal(getattr(twice, each.name), getattr(batch, each.name)) for each in fields(batch))
 
 
+def test_recoloured_batch_shows_the_same_in_another_light() -> None:
+    """Each step in its own, before and after alike; what is graspable stays, and what is brighter stays brighter."""
+    batch = make_batch()
+    batch.observations[:, 1:], batch.next_observations[:, 1:] = 100, 100
+    batch.observations[:, 1:, :15] = 200
+    other = batch.recoloured(torch.Generator().manual_seed(0))
+    for each, was in ((other.observations, batch.observations), (other.next_observations, batch.next_observations)):
+        assert torch.equal(each[:, 0], was[:, 0])
+        assert not torch.equal(each[:, 1:], was[:, 1:])
+    light = other.observations[:, 1:, 15:].float().mean(dim=(2, 3))
+    assert torch.allclose(light, other.next_observations[:, 1:].float().mean(dim=(2, 3)), atol=2)
+    assert light.std(dim=0).min() > 5
+    assert (other.observations[:, 1:, :15].float().mean(dim=(2, 3)) > light + 30).all()
+    assert other.actions is batch.actions
+    assert other.motions is batch.motions
+
+
 def test_positive_velocities_turn_left() -> None:
     assert last_sides(torch.tensor([30.0, -30.0, 0.0, -0.1])).tolist() == [1, -1, 1, -1]
 

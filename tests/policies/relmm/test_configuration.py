@@ -60,6 +60,7 @@ PAPER: dict[str, Any] = {
     "initial_temperature": 1.0,
     "clip_targets": False,
     "mirror": False,
+    "recolour": False,
     "tidied_share": 0.0,
     "refreshed_maps": 0,
 }
