@@ -32,7 +32,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python $(PIP_INSTALL) -c constraints.txt -e '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (about 10 minutes)
+demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (less than 15 minutes)
 	$(BIN)/relmm-train --robot.type=locobot_sim --robot.room=no_obstacles --dataset.repo_id=demo/no_obstacles \
 	  --steps=$(DEMO_STEPS) --seed=0 --output_dir=$(DEMO_DIR)/train
 # An untrained robot grasps at everything: 40 navigation steps of that are enough to see.

@@ -121,9 +121,7 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = [(name, seed, at, evaluate(config)) for name, seed, at, config in policies]
 
-    print(
-        f"{'policy':16}{'seed':>5}{'updates':>9}{'collected':>16}{'worst':>8}{'steps/object':>14}{'grasp success':>15}"
-    )
+    print(f"{'policy':16}{'seed':>5}{'updates':>9}{'collected':>16}{'worst':>8}{'steps/object':>14}{'grasped':>9}")
     for name, seed, at, scores in rows:
         share = 100 * np.array([score.collected / score.total for score in scores])
         grasped = sum(score.picked_up for score in scores) / sum(score.grasps for score in scores)

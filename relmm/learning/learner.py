@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from relmm.features import Phase
-from relmm.learning.replay import Replay, Table, to_pictures
+from relmm.learning.replay import Replay, to_pictures
 from relmm.policies.relmm.batch import NavigationBatch, last_sides, n_step
 from relmm.policies.relmm.maps import Maps
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
@@ -119,23 +119,16 @@ class Learner:
     def _navigation_loss(self) -> tuple[torch.Tensor, dict[str, float]]:
         size, replay = self.config.navigation_batch_size, self.replay
         others = round(size * self.config.pseudo_reset_share) if replay.available(replay.pseudo_reset_steps) else 0
-        chains = self._chains(replay.steps, size - others, self.config.return_steps)
+        length = self.config.return_steps
+        chains = replay.chains(replay.steps, replay.sample(replay.steps, size - others, self.rng), length, length)
         if others:
             # Random drives: what follows on their first step is not what the policy would do.
-            more = self._chains(replay.pseudo_reset_steps, others, 1)
+            chosen = replay.sample(replay.pseudo_reset_steps, others, self.rng)
+            more = replay.chains(replay.pseudo_reset_steps, chosen, length, 1)
             chains = {name: np.concatenate([chains[name], more[name]]) for name in chains}
         batch = self.policy.augmented(self.navigation_batch(chains), self.noise)
         noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)
         return self.policy.navigation.loss(batch, noise)
-
-    def _chains(self, table: Table, count: int, most: int) -> dict[str, NDArray[Any]]:
-        """Random ones of at most so many steps, as `Replay.chains` gives them, padded to `return_steps`."""
-        chains = self.replay.chains(table, self.replay.sample(table, count, self.rng), most)
-        missing = self.config.return_steps - most
-        padded = {
-            name: np.pad(chains[name], ((0, 0), (0, missing)), "edge") for name in ("frames", "success", "attempted")
-        }
-        return chains | padded
 
     def navigation_batch(self, chains: dict[str, NDArray[Any]]) -> NavigationBatch:
         """Navigation steps, as `Replay.chains` gives them, as a batch, relabelled by the current ensemble."""

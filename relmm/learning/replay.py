@@ -152,13 +152,14 @@ class Replay:
         """Velocities of the last navigation steps before frames, m/s and deg/s, shaped (..., 2)."""
         return self._motions[frames % self.capacity]
 
-    def chains(self, table: Table, rows: NDArray[np.int64], length: int) -> dict[str, NDArray[Any]]:
+    def chains(self, table: Table, rows: NDArray[np.int64], length: int, most: int) -> dict[str, NDArray[Any]]:
         """Navigation steps and those that followed on them, until a success.
 
         Args:
             table: `steps` or `pseudo_reset_steps`.
             rows: the first ones', (n,).
-            length: of a chain, at most.
+            length: that all are padded to.
+            most: steps of a chain, at most `length`.
 
         Returns:
             `frames`, before and after each step, (n, length + 1), and its `success` and whether grasps were
@@ -168,6 +169,7 @@ class Replay:
         indices = rows[:, None] + np.arange(length)
         columns = table.rows(np.minimum(indices, len(table) - 1))
         follows = (columns["frame"][:, 1:] == columns["next"][:, :-1]) & ~columns["success"][:, :-1]
+        follows[:, most - 1 :] = False
         lengths = 1 + np.logical_and.accumulate(follows & (indices[:, 1:] < len(table)), axis=1).sum(axis=1)
         last = np.minimum(np.arange(length), lengths[:, None] - 1)
         after, success, attempted = (

@@ -170,7 +170,7 @@ def test_equal_seeds_learn_the_same(make_learner) -> None:
 def test_navigation_batch_is_that_of_its_frames(relabel: bool, failed: bool, make_learner, numbered) -> None:
     learner = make_learner("dfdfs dfdss rrddd", relabel=relabel, relabel_failed=failed, refreshed_maps=0)
     policy, steps = learner.policy, learner.replay.steps
-    batch = learner.navigation_batch(learner.replay.chains(steps, np.arange(len(steps)), 1))
+    batch = learner.navigation_batch(learner.replay.chains(steps, np.arange(len(steps)), 1, 1))
     columns = (steps["frame"], steps["next"], steps["success"], steps["attempted"])
     for row, (frame, after, success, attempted) in enumerate(zip(*columns, strict=True)):
         pictures = to_pictures(np.stack([numbered(frame), numbered(after)]), torch.device("cpu"))
@@ -191,7 +191,7 @@ def test_chain_of_steps_is_one_from_the_first_frame_to_the_last(make_learner, nu
     """With the rewards on the way, relabelled; after the end there is no motion."""
     learner = make_learner("dddds", refreshed_maps=0)
     policy, gamma = learner.policy, learner.config.gamma
-    batch = learner.navigation_batch(learner.replay.chains(learner.replay.steps, np.array([0, 2]), 3))
+    batch = learner.navigation_batch(learner.replay.chains(learner.replay.steps, np.array([0, 2]), 3, 3))
     for row, frames in enumerate([[0, 1, 2, 3], [2, 3, 4]]):
         pictures = to_pictures(np.stack([numbered(frame) for frame in frames]), torch.device("cpu"))
         chances = policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1:].tolist()
@@ -345,7 +345,7 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
     loss, logs = policy.forward(batch)
 
     replay = learner.replay
-    steps = learner.navigation_batch(replay.chains(replay.steps, np.arange(len(replay.steps)), 1))
+    steps = learner.navigation_batch(replay.chains(replay.steps, np.arange(len(replay.steps)), 1, 1))
     assert set(steps.sides.tolist()) == {-1, 1}
     torch.manual_seed(3)
     navigation_loss, wanted = policy.navigation.loss(steps, torch.randn(2, len(replay.steps), 2))

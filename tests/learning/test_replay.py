@@ -143,16 +143,16 @@ def test_motions_are_those_that_the_frames_know_of(seed: int, fill: Fill, motion
 
 
 # --- Chains --------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("length", [1, 3, 5])
+@pytest.mark.parametrize(("length", "most"), [(1, 1), (3, 3), (5, 5), (5, 2), (3, 1)])
 @pytest.mark.parametrize("seed", range(8))
-def test_chains_follow_the_steps_until_a_success(length: int, seed: int, fill: Fill) -> None:
+def test_chains_follow_the_steps_until_a_success(length: int, most: int, seed: int, fill: Fill) -> None:
     """As one who walks from step to step."""
     replay = fill(random_life(seed))
     steps = {int(frame): row for row, frame in enumerate(replay.steps["frame"])}
-    chains = replay.chains(replay.steps, np.arange(len(replay.steps)), length)
+    chains = replay.chains(replay.steps, np.arange(len(replay.steps)), length, most)
     for row in range(len(replay.steps)):
         walk = [row]
-        while len(walk) < length and not replay.steps["success"][walk[-1]]:
+        while len(walk) < most and not replay.steps["success"][walk[-1]]:
             after = int(replay.steps["next"][walk[-1]])
             if after not in steps:
                 break
@@ -178,7 +178,7 @@ def test_chains_follow_the_steps_until_a_success(length: int, seed: int, fill: F
 )
 def test_chain_ends_where_something_else_was_done(life: Life, lengths: list[int], fill: Fill) -> None:
     replay = fill(life)
-    assert replay.chains(replay.steps, np.arange(len(replay.steps)), 3)["lengths"].tolist() == lengths
+    assert replay.chains(replay.steps, np.arange(len(replay.steps)), 3, 3)["lengths"].tolist() == lengths
 
 
 def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> None:
