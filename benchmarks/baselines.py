@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from lerobot.configs.policies import PreTrainedConfig
 
 import relmm.plugin  # noqa: F401
 from relmm.commands.evaluate import EpisodeScore, run_episode
@@ -26,11 +27,10 @@ ROOMS = ("no_obstacles", "obstacles", "diverse", "obstacles_rugs")
 POLICIES: dict[str, type[ControllerConfig]] = {"relmm_random": RelmmRandomConfig, "relmm_scripted": RelmmScriptedConfig}
 
 
-def evaluate(policy: str, room: str, seeds: range) -> list[EpisodeScore]:
+def evaluate(config: PreTrainedConfig, room: str, seeds: range) -> list[EpisodeScore]:
     """One policy in one room, an episode a seed, as `relmm-eval` does it."""
-    actor = make_actor(POLICIES[policy](device="cpu"))
-    env = RelmmRoomEnv(room=room)
-    scores = [run_episode(env, actor, seed, f"{policy} {room} {seed}", video=None) for seed in seeds]
+    actor, env = make_actor(config), RelmmRoomEnv(room=room)
+    scores = [run_episode(env, actor, seed, f"{config.type} {room} {seed}", video=None) for seed in seeds]
     env.close()
     return scores
 
@@ -48,7 +48,7 @@ def main() -> None:
     print(f"{'policy':16}{'room':16}{'collected':>16}{'grasp success':>16}{'judged right':>14}")
     for policy in POLICIES:
         for room in ROOMS:
-            scores = evaluate(policy, room, seeds)
+            scores = evaluate(POLICIES[policy](device="cpu"), room, seeds)
             share = 100 * np.array([score.collected / score.total for score in scores])
             grasps, lifted = sum(score.grasps for score in scores), sum(score.picked_up for score in scores)
             wrong = sum(abs(score.picked_up - score.picked_up_judged) for score in scores)

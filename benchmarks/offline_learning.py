@@ -18,14 +18,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from baselines import evaluate
 from lerobot.configs.policies import PreTrainedConfig
 
 import relmm.plugin  # noqa: F401
-from relmm.commands.evaluate import EpisodeScore, run_episode
-from relmm.commands.policies import make_actor
+from relmm.commands.evaluate import EpisodeScore
 from relmm.policies.random.configuration_random import RelmmRandomConfig
 from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
-from relmm.sim.env import RelmmRoomEnv
 
 RESULTS = Path(__file__).parent / "results" / "offline_learning.csv"
 PICTURE = Path(__file__).parents[1] / "docs" / "offline_learning.png"
@@ -48,15 +47,6 @@ def run(command: str, folder: Path) -> None:
     program, *arguments = shlex.split(command)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
     subprocess.run([Path(sys.executable).parent / program, *arguments], check=True, cwd=folder, env=environment)
-
-
-def evaluate(config: PreTrainedConfig) -> list[EpisodeScore]:
-    """Its episodes, as `relmm-eval` does them."""
-    config.device = "cpu"
-    actor, env = make_actor(config), RelmmRoomEnv(room=ROOM)
-    scores = [run_episode(env, actor, seed, f"{config.type} {seed}", video=None) for seed in SEEDS]
-    env.close()
-    return scores
 
 
 def checkpoints(folder: Path) -> dict[int, PreTrainedConfig]:
@@ -110,8 +100,8 @@ def main() -> None:
     if not (arguments.output / "dataset").exists():
         run(RECORD, arguments.output)
     policies: list[tuple[str, int, int, PreTrainedConfig]] = [
-        ("relmm_scripted", 0, 0, RelmmScriptedConfig()),
-        ("relmm_random", 0, 0, RelmmRandomConfig()),
+        ("relmm_scripted", 0, 0, RelmmScriptedConfig(device="cpu")),
+        ("relmm_random", 0, 0, RelmmRandomConfig(device="cpu")),
     ]
     for seed in arguments.seeds:
         trained = arguments.output / f"seed_{seed}"
@@ -119,7 +109,7 @@ def main() -> None:
             run(f"{TRAIN} --seed={seed} --output_dir={trained.name}", arguments.output)
         policies += [("relmm", seed, at, config) for at, config in checkpoints(trained).items()]
     torch.set_num_threads(1)
-    rows = [(name, seed, at, evaluate(config)) for name, seed, at, config in policies]
+    rows = [(name, seed, at, evaluate(config, ROOM, SEEDS)) for name, seed, at, config in policies]
 
     print(f"{'policy':16}{'seed':>5}{'updates':>9}{'collected':>16}{'worst':>8}{'steps/object':>14}{'grasped':>9}")
     for name, seed, at, scores in rows:
