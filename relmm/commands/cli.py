@@ -76,7 +76,7 @@ def _parse[Config](config_class: type[Config]) -> Config:
             raise
         # The parser has printed its usage and an error; draccus hides our own checks' words among the causes.
         last_line = messages.getvalue().strip().split("\n")[-1].split("error: ", 1)[-1]
-        raise own_error(stop) or ConfigError(f"{last_line} (--help shows what there is).") from stop
+        raise own_error(stop) or ConfigError(f"{last_line} (--help_all shows what there is).") from stop
     except (draccus.utils.DraccusException, argparse.ArgumentError) as error:
         raise own_error(error) or ConfigError(_sentence(error)) from error
 
