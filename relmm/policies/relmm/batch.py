@@ -19,7 +19,8 @@ class NavigationBatch:
 
     Attributes:
         observations, next_observations: uint8, (batch, channels, height, width).
-        sides, next_sides: to which the robot had turned last, 1 for the left and -1 for the right, (batch,).
+        sides, next_sides: to which the robot turns where it sees nothing, 1 for the left and -1 for the right,
+            (batch,). That of its last turn is taken for it.
         actions: -1..1, (batch, 2).
         rewards: -1..0 for one step, (batch,).
         continues: what the next observation's value counts, but for one factor gamma: 1 where the search goes on, 0

@@ -91,12 +91,14 @@ class FloorObserver(nn.Module):
     def background_loss(
         self, images: Tensor, grasping: GraspEnsemble, rng: torch.Generator, offline: bool = False
     ) -> Tensor:
-        """Cross-entropy of "nothing to grasp here" at one random place in each picture.
+        """How graspable a random place in each picture seems, the mean; summed over the members.
 
         No attempt is ever made at walls or furniture, so the network that draws the map would answer there as it
-        pleases. Nearly all places are empty; the few that are not look like what attempts have taught. A robot that
-        learns while it acts finds out about what is in reach, so places beyond it are enough, and the map's member.
-        `offline`, who recorded the data may never have failed, and all members learn from all places.
+        pleases. Nearly all places are empty; the few that are not look like what attempts have taught. This loss lets
+        them be (Ghosh et al. 2017: with wrong labels, the absolute error): cross-entropy would teach, for as long as
+        it is learned, that what is far is no thing to grasp. A robot that learns while it acts finds out about what is
+        in reach, so places beyond it are enough, and the map's member. `offline`, who recorded the data may never have
+        failed, and all members learn from all places.
         """
         assert isinstance(grasping.backbone, RectifiedBackbone)
         everywhere, beyond = self._places
@@ -106,7 +108,7 @@ class FloorObserver(nn.Module):
         patch = torch.arange(2 * self._margin + 1, device=images.device)
         grid = self.view.grid[(rows + patch)[:, :, None], (columns + patch)[:, None, :]]
         logits = grasping.backbone.on_map(self.view.at(images, grid), members=None if offline else 1)
-        return functional.softplus(logits).flatten(1).mean(dim=1).sum()
+        return logits.sigmoid().flatten(1).mean(dim=1).sum()
 
 
 def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:

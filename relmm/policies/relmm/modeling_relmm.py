@@ -19,7 +19,7 @@ from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm.maps import Maps
 from relmm.policies.relmm.navigation import ACTIONS, Navigation, to_navigation_step
 from relmm.policies.relmm.offline import CAPACITY, Batch, Recollection, Rows
-from relmm.policies.relmm.searching import Search
+from relmm.policies.relmm.searching import Search, nearest_bearing
 
 _TURN = STATE_NAMES.index("theta.vel")
 
@@ -84,14 +84,13 @@ class ReLMMPolicy(ControllerPolicy):
         Args:
             pictures: one, 0..1, (1, 3, 100, 100).
             theta_vel: of the last navigation step, deg/s.
-            search: what the robot has seen since its last one.
+            search: what the robot remembers.
             rng: to sample with.
         """
         observations = self.observer(pictures, self.grasping)
-        if self.navigation.is_orderly and search.leaves(bool(self.navigation.in_view(observations)), theta_vel):
+        if self.navigation.is_orderly and search.leaves(nearest_bearing(observations[0]), theta_vel):
             return to_navigation_step([1.0, 0.0])
-        sides = last_sides(torch.tensor([theta_vel], device=self.weights_device))
-        action = self.navigation.act(observations, sides, rng)[0]
+        action = self.navigation.act(observations, torch.tensor([search.side], device=self.weights_device), rng)[0]
         return to_navigation_step(action.tolist())
 
     def to_pictures(self, image: NDArray[Any]) -> Tensor:
@@ -146,8 +145,7 @@ class ReLMMPolicy(ControllerPolicy):
         if len(steps) > 0:
             navigation_batch = self.augmented(self._navigation_batch(steps, find), self.rng)
             noise = torch.randn(2, len(steps), ACTIONS, device=self.weights_device)
-            conservatism = self.config.conservative_weight
-            navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise, conservatism)
+            navigation_loss, navigation_logs = self.navigation.loss(navigation_batch, noise, offline=True)
             losses.append(navigation_loss)
             logs |= navigation_logs
         return torch.stack(losses).sum(), logs

@@ -107,13 +107,14 @@ class Navigation(nn.Module):
             noise = torch.randn(len(observations), ACTIONS, generator=rng).to(observations.device)
             return self._sample(observations, sides, noise)[0]
 
-    def loss(self, batch: NavigationBatch, noise: Tensor, conservatism: float = 0.0) -> tuple[Tensor, dict[str, float]]:
+    def loss(self, batch: NavigationBatch, noise: Tensor, offline: bool = False) -> tuple[Tensor, dict[str, float]]:
         """The sum of the critics', the actor's and the temperature's loss; none has gradients in another's weights.
 
         Args:
             batch: navigation steps.
             noise: standard normal, (2, batch, 2): for the actions at this and at the next observation.
-            conservatism: weight of conservative Q-learning, for steps that nobody can try out again.
+            offline: whether nobody will try out what the actor makes of it: see `conservative_weight` and
+                `imitation_weight`.
 
         Returns:
             The loss and its parts, for logs.
@@ -123,8 +124,8 @@ class Navigation(nn.Module):
         features = self.critics.encode(batch.observations)
         values = self.critics(features, batch.actions)
         critic_loss = functional.mse_loss(values, targets.expand_as(values))
-        if conservatism > 0:
-            critic_loss = critic_loss + conservatism * self._overestimate(features, values)
+        if offline:
+            critic_loss = critic_loss + self.config.conservative_weight * self._overestimate(features, values)
 
         actions, log_density = self._sample(batch.observations, batch.sides, noise[0], features)
         # Through the critics to the actions, but not into the critics.
@@ -132,6 +133,9 @@ class Navigation(nn.Module):
         reached = self.critics([each.detach() for each in features], actions).amin(dim=0)
         self.critics.requires_grad_(True)
         actor_loss = (temperature * log_density - reached).mean()
+        if offline:
+            better = values.detach().amin(dim=0) > reached.detach()
+            actor_loss = actor_loss + self.config.imitation_weight * (better * self._distance(batch, features)).mean()
 
         entropy_gap = (log_density.detach() + self.config.target_entropy).mean()
         temperature_loss = -self.log_temperature.exp() * entropy_gap
@@ -149,6 +153,11 @@ class Navigation(nn.Module):
         uniform = torch.rand(_UNIFORM_ACTIONS, len(features[0]), ACTIONS, device=values.device) * 2 - 1
         others = torch.stack([self.critics(features, actions) for actions in uniform])
         return (others.logsumexp(dim=0) - math.log(_UNIFORM_ACTIONS) - values).mean()
+
+    def _distance(self, batch: NavigationBatch, encoded: list[Tensor]) -> Tensor:
+        """How far the mean actions are from those that were taken, squared, (batch,) (Fujimoto & Gu 2021)."""
+        means = self.actor(self._actor_features(batch.observations, encoded))[0].tanh()
+        return (self._search(means, batch.observations, batch.sides) - batch.actions).square().sum(dim=-1)
 
     @torch.no_grad()
     def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:
@@ -185,15 +194,17 @@ class Navigation(nn.Module):
         self, observations: Tensor, sides: Tensor, noise: Tensor, encoded: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Actions of the actor and the log-densities of what it chose, for observations that may be encoded already."""
-        if self.actor_encoder is not None:
-            features = self.actor_encoder(observations)
-        else:
-            features = (self.critics.encode(observations) if encoded is None else encoded)[0].detach()
-        actions, log_density = self.actor.sample(features, noise)
+        actions, log_density = self.actor.sample(self._actor_features(observations, encoded), noise)
         return self._search(actions, observations, sides), log_density
 
+    def _actor_features(self, observations: Tensor, encoded: list[Tensor] | None) -> Tensor:
+        if self.actor_encoder is not None:
+            features: Tensor = self.actor_encoder(observations)
+            return features
+        return (self.critics.encode(observations) if encoded is None else encoded)[0].detach()
+
     def _search(self, actions: Tensor, observations: Tensor, sides: Tensor) -> Tensor:
-        """Actions that, where the map shows nothing to grasp, turn only to the side of the last turn.
+        """Actions that, where the map shows nothing to grasp, turn only to one side.
 
         There left and right are worth nearly the same. A policy that follows the slightest difference turns to and fro
         before a bare wall for ever.

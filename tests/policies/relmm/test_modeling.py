@@ -390,7 +390,7 @@ def test_forward_learns_a_drive_as_the_replay_knows_it(outcomes, after, success,
         assert logs is not None
         torch.manual_seed(7)
         batch, noise = expected_batch(green, episode, after, success), torch.randn(2, 1, 2)
-        wanted = green.navigation.loss(batch, noise, green.config.conservative_weight)[1]
+        wanted = green.navigation.loss(batch, noise, offline=True)[1]
         assert {name: logs[name] for name in wanted} == pytest.approx(wanted, rel=1e-4)
 
 
@@ -453,7 +453,11 @@ def shown(monkeypatch) -> Callable[[ReLMMPolicy], dict[str, list[Any]]]:
         seen: dict[str, list[Any]] = {"grasping": [], "navigation": []}
         for name, arguments in seen.items():
             loss = getattr(policy, name).loss
-            record = lambda *given, loss=loss, seen=arguments: seen.append(given[0]) or loss(*given)  # noqa: E731
+
+            def record(*given, loss=loss, seen=arguments, **options):
+                seen.append(given[0])
+                return loss(*given, **options)
+
             monkeypatch.setattr(getattr(policy, name), "loss", record)
         return seen
 
