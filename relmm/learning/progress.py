@@ -61,10 +61,15 @@ class Metrics:
 
     Args:
         path: of the file; appended to.
+
+    Attributes:
+        seconds: of training that the file already tells of.
     """
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        lines = read_metrics(path) if path.exists() else []
+        self.seconds = max((line.get("seconds", 0.0) for line in lines), default=0.0)
         torn = path.exists() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
         self._file = path.open("a", encoding="utf-8")
         if torn:  # a killed run may have left half a line

@@ -58,7 +58,7 @@ class Session:
     ) -> None:
         self._schedule, self._progress, self._learner, self._metrics = schedule, progress, learner, metrics
         self._save, self._evaluate, self._show, self._upload = save, evaluate, show, upload
-        self._started = time.monotonic()
+        self._started = time.monotonic() - metrics.seconds  # a resumed run goes on
         self._saved_at = -1
 
     def live(self, trainer: Trainer, should_stop: Callable[[], bool]) -> None:

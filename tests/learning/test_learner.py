@@ -319,7 +319,6 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
         "return_steps": 1,
         "background_weight": 0.0,
         "conservative_weight": 0.0,
-        "imitation_weight": 0.0,
         "mirror": False,
         "recolour": False,
         "tidied_share": 0.0,

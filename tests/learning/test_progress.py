@@ -50,6 +50,15 @@ def test_metrics_are_read_as_written_and_appended_to(tmp_path: Path) -> None:
     assert [line["steps"] for line in read_metrics(path)] == [1, 2]
 
 
+def test_metrics_of_a_resumed_run_know_how_long_it_has_trained(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    for before, after in ((0.0, 4.5), (4.5, 7.0), (7.0, 7.5)):
+        metrics = Metrics(path)
+        assert metrics.seconds == before
+        metrics.write(steps=1, seconds=after)
+        metrics.close()
+
+
 def test_half_a_line_of_a_killed_run_costs_that_line_alone(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"steps": 1}\n{"steps": 2, "lo', encoding="utf-8")

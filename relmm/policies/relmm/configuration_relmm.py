@@ -72,7 +72,6 @@ class ReLMMConfig(ControllerConfig):
         initial_temperature: of SAC.
         clip_targets: keep Bellman targets within what rewards of -1 to 0 allow.
         conservative_weight: of conservative Q-learning in `forward`, that is, when LeRobot trains from a dataset alone.
-        imitation_weight: there, of the distance to recorded actions that the critics find better than the actor's own.
         mirror: learn from mirrored maps of the floor, too.
         recolour: learn from maps of the floor in another light each time.
         tidied_share: of a batch of maps of the floor, in which part of what lay about is gone, to learn how to finish.
@@ -130,7 +129,6 @@ class ReLMMConfig(ControllerConfig):
     initial_temperature: float = 0.1
     clip_targets: bool = True
     conservative_weight: float = 0.5
-    imitation_weight: float = 1.0
     mirror: bool = True
     recolour: bool = True
     tidied_share: float = 0.5
@@ -208,7 +206,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "initial_temperature": (_TINY, math.inf),
     "pseudo_reset_share": (0, 0.9),
     "conservative_weight": (0, math.inf),
-    "imitation_weight": (0, math.inf),
     "tidied_share": (0, 1),
     "refreshed_maps": (0, math.inf),
 }

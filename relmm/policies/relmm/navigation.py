@@ -113,8 +113,7 @@ class Navigation(nn.Module):
         Args:
             batch: navigation steps.
             noise: standard normal, (2, batch, 2): for the actions at this and at the next observation.
-            offline: whether nobody will try out what the actor makes of it: see `conservative_weight` and
-                `imitation_weight`.
+            offline: whether nobody will try out what the actor makes of it: see `conservative_weight`.
 
         Returns:
             The loss and its parts, for logs.
@@ -133,9 +132,6 @@ class Navigation(nn.Module):
         reached = self.critics([each.detach() for each in features], actions).amin(dim=0)
         self.critics.requires_grad_(True)
         actor_loss = (temperature * log_density - reached).mean()
-        if offline:
-            better = values.detach().amin(dim=0) > reached.detach()
-            actor_loss = actor_loss + self.config.imitation_weight * (better * self._distance(batch, features)).mean()
 
         entropy_gap = (log_density.detach() + self.config.target_entropy).mean()
         temperature_loss = -self.log_temperature.exp() * entropy_gap
@@ -153,11 +149,6 @@ class Navigation(nn.Module):
         uniform = torch.rand(_UNIFORM_ACTIONS, len(features[0]), ACTIONS, device=values.device) * 2 - 1
         others = torch.stack([self.critics(features, actions) for actions in uniform])
         return (others.logsumexp(dim=0) - math.log(_UNIFORM_ACTIONS) - values).mean()
-
-    def _distance(self, batch: NavigationBatch, encoded: list[Tensor]) -> Tensor:
-        """How far the mean actions are from those that were taken, squared, (batch,) (Fujimoto & Gu 2021)."""
-        means = self.actor(self._actor_features(batch.observations, encoded))[0].tanh()
-        return (self._search(means, batch.observations, batch.sides) - batch.actions).square().sum(dim=-1)
 
     @torch.no_grad()
     def bellman_targets(self, batch: NavigationBatch, noise: Tensor, temperature: Tensor) -> Tensor:
@@ -194,14 +185,12 @@ class Navigation(nn.Module):
         self, observations: Tensor, sides: Tensor, noise: Tensor, encoded: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Actions of the actor and the log-densities of what it chose, for observations that may be encoded already."""
-        actions, log_density = self.actor.sample(self._actor_features(observations, encoded), noise)
-        return self._search(actions, observations, sides), log_density
-
-    def _actor_features(self, observations: Tensor, encoded: list[Tensor] | None) -> Tensor:
         if self.actor_encoder is not None:
-            features: Tensor = self.actor_encoder(observations)
-            return features
-        return (self.critics.encode(observations) if encoded is None else encoded)[0].detach()
+            features = self.actor_encoder(observations)
+        else:
+            features = (self.critics.encode(observations) if encoded is None else encoded)[0].detach()
+        actions, log_density = self.actor.sample(features, noise)
+        return self._search(actions, observations, sides), log_density
 
     def _search(self, actions: Tensor, observations: Tensor, sides: Tensor) -> Tensor:
         """Actions that, where the map shows nothing to grasp, turn only to one side.
