@@ -21,8 +21,10 @@ from relmm.episodes.remote import download, push_folder, reason
 from relmm.episodes.upload import refuse_other_runs, runs_of
 from relmm.errors import ConfigError, HubError
 from relmm.learning.checkpoint import portable_config, pretrained_model, training_state
+from relmm.learning.progress import Progress, read_metrics
 from relmm.learning.untrusted import CONFIG, WEIGHTS, check_policy_folder, read_json
 
+_EVALUATION, _HUGE = {"eval_collected_std", "eval_collected_each"}, 1e15
 METRICS, CURVE, CARD = "metrics.jsonl", "learning_curve.png", "README.md"
 _DATASET = "training_state/dataset.json"
 _TRAIN_CONFIG = "train_config.json"
@@ -175,7 +177,30 @@ def fetch_checkpoint(repo_id: str, revision: str) -> tuple[Path, Source]:
             f"the model {repo_id} on the Hub has no {_DATASET}, so training cannot go on from it; "
             f"begin a run with its weights: leave out --resume=true."
         )
+    if (folder / METRICS).is_file():
+        _check_metrics(folder / METRICS)
     return folder, _read_source(folder / _DATASET)
+
+
+def _check_metrics(path: Path) -> None:
+    """The run's clock, curve and card are made from them."""
+    try:
+        plausible = all(map(_is_plausible, read_metrics(path)))
+    except (UnicodeDecodeError, RecursionError):
+        plausible = False
+    if not plausible:
+        raise ConfigError(f"{path} has lines that are no metrics of a run; use another checkpoint.")
+
+
+def _is_plausible(line: object) -> bool:
+    if not isinstance(line, dict):
+        return False
+    evaluation = _EVALUATION if "eval_collected" in line else set()
+    each = line.get("eval_collected_each", [])
+    if not isinstance(each, list) or not {*Progress().asdict(), "seconds", *evaluation} <= line.keys():
+        return False
+    numbers = [*(value for name, value in line.items() if name != "eval_collected_each"), *each]
+    return all(type(number) in (int, float) and abs(number) < _HUGE for number in numbers)
 
 
 def _read_source(path: Path) -> Source:

@@ -68,11 +68,10 @@ class Metrics:
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        lines = read_metrics(path) if path.exists() else []
-        self.seconds = max((line.get("seconds", 0.0) for line in lines), default=0.0)
-        torn = path.exists() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
         self._file = path.open("a", encoding="utf-8")
-        if torn:  # a killed run may have left half a line
+        self.seconds = max((line.get("seconds", 0.0) for line in read_metrics(path)), default=0.0)
+        written = path.read_bytes()
+        if written and not written.endswith(b"\n"):  # a killed run may have left half a line
             self._file.write("\n")
 
     def write(self, **values: Any) -> None:

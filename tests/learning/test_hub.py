@@ -13,6 +13,7 @@ from relmm.errors import ConfigError, HubError
 from relmm.learning.checkpoint import install_checkpoint, last_checkpoint, load_training_state, save_checkpoint
 from relmm.learning.hub import fetch_checkpoint, fetch_policy, upload_checkpoint
 from relmm.learning.learner import Learner
+from relmm.learning.progress import Progress
 from relmm.learning.replay import Replay
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
@@ -185,4 +186,32 @@ def test_nonsense_about_the_dataset(hub, save_step, content):
     repo = hub.repo(NAME)
     repo.commit(repo.files | {"training_state/dataset.json": content})
     with pytest.raises(ConfigError, match=re.escape("does not say what the checkpoint was trained on")):
+        fetch_checkpoint(NAME, "main")
+
+
+LINE = json.dumps(Progress().asdict()).encode()[:-1] + b', "seconds": '
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"[]",
+        b'"steps"',
+        b'{"steps": 1}',
+        LINE + b'"long"}',
+        LINE + b"NaN}",
+        LINE + b'1, "eval_collected": 0.5}',
+        LINE + b'1, "eval_collected_std": 0, "eval_collected_each": [], "eval_collected": ["much"]}',
+        b"\xff\xfe",
+        b"[" * 100_000,
+    ],
+)
+def test_nonsense_in_the_metrics(hub, save_step, content):
+    push(save_step(7))
+    repo = hub.repo(NAME)
+    healthy = LINE + b'2.5, "eval_collected": 0.5, "eval_collected_std": 0.1, "eval_collected_each": [0.4, 0.6]}\n'
+    repo.commit(repo.files | {"metrics.jsonl": healthy})
+    fetch_checkpoint(NAME, "main")
+    repo.commit(repo.files | {"metrics.jsonl": healthy + content + b"\n"})
+    with pytest.raises(ConfigError, match="has lines that are no metrics of a run"):
         fetch_checkpoint(NAME, "main")
