@@ -132,7 +132,7 @@ class ReLMMConfig(ControllerConfig):
     mirror: bool = True
     recolour: bool = True
     tidied_share: float = 0.5
-    refreshed_maps: int = 6
+    refreshed_maps: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()

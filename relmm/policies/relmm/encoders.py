@@ -21,6 +21,7 @@ from relmm.policies.relmm.grasping import GraspEnsemble, RectifiedBackbone
 _CELLS = 7
 _ROWS, _COLUMNS = 30, 31
 _NEAR_ROWS = 1  # pixels of the map before the grasp area
+_BANDS = 3  # strips across the map, each as wide as the camera sees the floor there
 NOTICED = 64  # of 255, graspability from which on something is in view
 _HEADS = 8
 _INITIAL_ATTENTION = 6.0  # score of a certain grasp; -6 for a hopeless one
@@ -76,16 +77,20 @@ class FloorObserver(nn.Module):
         beyond = known.clone()
         beyond[: GRID - row] = False
         self._places: tuple[Tensor, Tensor] = known.nonzero(), beyond.nonzero()  # (n, 2)
+        bands = [_rectangle(known, first, first + rows // _BANDS) for first in range(0, rows, rows // _BANDS)]
+        self._bands = [band for band in bands if band is not None]
 
     @torch.no_grad()
     def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
         """Grasp probability (the highest in each pixel) and RGB (their mean), uint8, (batch, 4, 30, 31)."""
         assert isinstance(grasping.backbone, RectifiedBackbone)
-        floor = self.view(images)
-        logits = grasping.backbone.on_map(floor, members=1)[0]  # all six would take six times as long
-        graspable = functional.max_pool2d(logits.sigmoid() * self.known, _CELLS)
-        inner = floor[:, :, self._margin : -self._margin, self._margin : -self._margin]
-        colours = functional.avg_pool2d(inner, _CELLS) / 2 + 0.5
+        floor, margin = self.view(images), self._margin
+        chances = floor.new_zeros(len(images), *self.known.shape)
+        for rows, columns in self._bands:
+            band = floor[:, :, rows.start : rows.stop + 2 * margin, columns.start : columns.stop + 2 * margin]
+            chances[:, rows, columns] = grasping.backbone.first_on_map(band).sigmoid()
+        graspable = functional.max_pool2d(chances * self.known, _CELLS)
+        colours = functional.avg_pool2d(floor[:, :, margin:-margin, margin:-margin], _CELLS) / 2 + 0.5
         return (torch.cat([graspable[:, None], colours], dim=1) * 255).round().to(torch.uint8)
 
     def background_loss(
@@ -109,6 +114,12 @@ class FloorObserver(nn.Module):
         grid = self.view.grid[(rows + patch)[:, :, None], (columns + patch)[:, None, :]]
         logits = grasping.backbone.on_map(self.view.at(images, grid), members=None if offline else 1)
         return logits.sigmoid().flatten(1).mean(dim=1).sum()
+
+
+def _rectangle(known: Tensor, first: int, last: int) -> tuple[slice, slice] | None:
+    """Rows and columns of what is known in a strip of the map, if anything is."""
+    columns = known[first:last].any(dim=0).nonzero()
+    return (slice(first, last), slice(int(columns.min()), int(columns.max()) + 1)) if len(columns) else None
 
 
 def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
@@ -139,10 +150,11 @@ class Keypoints(nn.Module):
 
     def forward(self, maps: Tensor) -> Tensor:
         """Maps in -1..1, (batch, 4, 30, 31) -> x and y in m and graspability of each point, (batch, 3 * heads)."""
-        attention = (self.look(maps).flatten(2) + self.prefer).softmax(dim=-1)
-        graspable = maps[:, :1].flatten(2)
-        values = torch.cat([self.places.expand(len(maps), -1, -1), graspable], dim=1)
-        return torch.einsum("bhp,bvp->bhv", attention, values).flatten(1)
+        maps, count = maps.flatten(2), len(maps)
+        look = self.look.weight.flatten(1).expand(count, -1, -1)
+        attention = torch.baddbmm(self.prefer.expand(count, -1, -1), look, maps).softmax(dim=-1)
+        values = torch.cat([self.places.expand(count, -1, -1), maps[:, :1]], dim=1)
+        return torch.bmm(attention, values.transpose(1, 2)).flatten(1)
 
 
 class Encoder(nn.Module):
@@ -186,7 +198,7 @@ def _paper_small_layers() -> list[nn.Module]:
 
 
 def _floor_layers() -> list[nn.Module]:
-    widths = (FloorObserver.shape[0], 32, 64, 64)
+    widths = (FloorObserver.shape[0], 16, 32, 32)
     convolutions = [
         layer
         for inputs, outputs in pairwise(widths)

@@ -42,6 +42,17 @@ def test_map_agrees_with_the_grasp_cells_where_the_arm_reaches(observer, ensembl
     assert (drawn.float() - functional.max_pool2d(cells, PIXEL) * 255).abs().max() <= 1
 
 
+@pytest.mark.parametrize("camera", ["paper", "d435"])
+def test_map_shows_all_that_is_in_view(camera, make_config, noise_pictures) -> None:
+    """Against the first member on the whole floor at once."""
+    config, images = make_config(camera=camera), noise_pictures(2)
+    observer, ensemble = FloorObserver(config), GraspEnsemble(config)
+    everywhere = ensemble.backbone.on_map(observer.view(images))[0].sigmoid() * observer.known
+    assert torch.allclose(ensemble.backbone.first_on_map(observer.view(images)).sigmoid() * observer.known, everywhere)
+    drawn = observer(images, ensemble)[:, 0].float()
+    assert (drawn - functional.max_pool2d(everywhere, PIXEL) * 255).abs().max() <= 1
+
+
 def test_map_shows_the_mean_colours_of_the_floor(observer, ensemble, noise_pictures) -> None:
     images = noise_pictures(2)
     floor = ensemble.backbone.view(images)[:, :, 4:-4, 4:-4]
