@@ -34,6 +34,7 @@ SMALL = {
     "navigation_batch_size": 4,
     "min_attempts_to_update": 1,
     "min_steps_to_update": 1,
+    "refreshed_maps": 0,  # all: the kept ones are not saved
 }
 
 
