@@ -77,8 +77,8 @@ class FloorObserver(nn.Module):
         beyond = known.clone()
         beyond[: GRID - row] = False
         self._places: tuple[Tensor, Tensor] = known.nonzero(), beyond.nonzero()  # (n, 2)
-        bands = [_rectangle(known, first, first + rows // _BANDS) for first in range(0, rows, rows // _BANDS)]
-        self._bands = [band for band in bands if band is not None]
+        strips = [(first, first + rows // _BANDS) for first in range(0, rows, rows // _BANDS)]
+        self._bands = [_rectangle(known, *strip) for strip in strips if known[slice(*strip)].any()]
 
     @torch.no_grad()
     def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
@@ -116,10 +116,10 @@ class FloorObserver(nn.Module):
         return logits.sigmoid().flatten(1).mean(dim=1).sum()
 
 
-def _rectangle(known: Tensor, first: int, last: int) -> tuple[slice, slice] | None:
-    """Rows and columns of what is known in a strip of the map, if anything is."""
+def _rectangle(known: Tensor, first: int, last: int) -> tuple[slice, slice]:
+    """Rows and columns of what is known in a strip of the map."""
     columns = known[first:last].any(dim=0).nonzero()
-    return (slice(first, last), slice(int(columns.min()), int(columns.max()) + 1)) if len(columns) else None
+    return slice(first, last), slice(int(columns.min()), int(columns.max()) + 1)
 
 
 def make_observer(config: ReLMMConfig) -> PictureObserver | FloorObserver:
@@ -141,7 +141,7 @@ class Keypoints(nn.Module):
         self.places: Tensor
         middle = torch.tensor([[sum(GRASP_X) / 2], [sum(GRASP_Y) / 2]])
         self.register_buffer("places", map_places().flatten(1) - middle, persistent=False)
-        self.look = nn.Conv2d(FloorObserver.shape[0], _HEADS, 1, bias=False)
+        self.look = nn.Linear(FloorObserver.shape[0], _HEADS, bias=False)
         with torch.no_grad():
             self.look.weight.mul_(0.1)
             self.look.weight[:, 0] = _INITIAL_ATTENTION
@@ -151,8 +151,8 @@ class Keypoints(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         """Maps in -1..1, (batch, 4, 30, 31) -> x and y in m and graspability of each point, (batch, 3 * heads)."""
         maps, count = maps.flatten(2), len(maps)
-        look = self.look.weight.flatten(1).expand(count, -1, -1)
-        attention = torch.baddbmm(self.prefer.expand(count, -1, -1), look, maps).softmax(dim=-1)
+        look, prefer = self.look.weight.expand(count, -1, -1), self.prefer.expand(count, -1, -1)
+        attention = torch.baddbmm(prefer, look, maps).softmax(dim=-1)
         values = torch.cat([self.places.expand(count, -1, -1), maps[:, :1]], dim=1)
         return torch.bmm(attention, values.transpose(1, 2)).flatten(1)
 
