@@ -137,26 +137,30 @@ def show(rows: list[dict[str, str]]) -> None:
 
 
 def plot(rows: list[dict[str, str]], path: Path) -> None:
-    """One curve a run: the mean over seeds, and every seed faintly."""
+    """One curve a run, the mean over seeds, every seed faintly; the first room left, the others right."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(9, 5), layout="constrained")
+    figure, panels = plt.subplots(1, 2, figsize=(13, 5), layout="constrained", sharey=True)
     for run in [run for run in RUNS if any(row["run"] == run for row in rows)]:
+        axes = panels[0 if "room=no_obstacles" in RUNS[run] else 1]
         mine = [row for row in rows if row["run"] == run]
         seeds = sorted({row["seed"] for row in mine})
         curves = [[(int(r["step"]), 100 * float(r["collected"])) for r in mine if r["seed"] == s] for s in seeds]
         steps = sorted({step for curve in curves for step, _ in curve})
         means = [np.mean([share for curve in curves for step, share in curve if step == at]) for at in steps]
-        (line,) = axes.plot(steps, means, marker="o", label=f"{run} ({len(seeds)} seeds)")
+        (line,) = axes.plot(steps, means, marker="o", label=f"{run}, {len(seeds)} seed{'s' * (len(seeds) > 1)}")
         for curve in curves:
             axes.plot(*zip(*curve, strict=True), color=line.get_color(), alpha=0.25, linewidth=1)
-    axes.set(xlabel="navigation steps", ylabel="objects collected, %", ylim=(0, 102))
-    axes.axhline(90, color="grey", linestyle=":", label="the paper's, after 30,000 steps")
-    axes.legend(loc="lower right", fontsize=8)
-    axes.grid(alpha=0.3)
+    panels[0].axhline(90, color="grey", linestyle=":", label="the paper's, after 30,000 steps")
+    panels[0].set(title="no_obstacles", ylabel="objects collected, %", ylim=(0, 102))
+    panels[1].set(title="the other rooms")
+    for axes in panels:
+        axes.set(xlabel="navigation steps")
+        axes.legend(loc="lower right", fontsize=8)
+        axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
 
 
