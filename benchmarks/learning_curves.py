@@ -159,7 +159,7 @@ def plot(rows: list[dict[str, str]], path: Path) -> None:
     panels[1].set(title="the other rooms")
     for axes in panels:
         axes.set(xlabel="navigation steps")
-        axes.legend(loc="lower right", fontsize=8)
+        axes.legend(loc="center right", fontsize=8)
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
 
