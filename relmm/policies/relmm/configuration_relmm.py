@@ -44,6 +44,9 @@ class ReLMMConfig(ControllerConfig):
             alone would teach it that nothing can be grasped anywhere, and its members to agree on that.
         background_weight: how much the member that draws the navigation's map learns, from random places beyond reach,
             that nothing can be grasped there.
+        offline_grasp_updates: first updates of `lerobot-train`, by which the ensemble learns. Then navigation does: its
+            maps and rewards come from the ensemble, and the recorded attempts, learned for too long, teach it that what
+            is far is nothing to grasp. 0 for a policy whose ensemble has learned already.
         freeze_grasping: the ensemble learns in the curriculum only.
         num_stationary: attempts of the stationary curriculum.
         min_attempts_to_update: attempts stored before the first update; until then cells are drawn uniformly.
@@ -100,6 +103,7 @@ class ReLMMConfig(ControllerConfig):
     grasp_updates: int = 4
     min_failure_loss: float = 0.1
     background_weight: float = 0.3
+    offline_grasp_updates: int = 600
     freeze_grasping: bool = False
     # Curricula (paper 4.4 and App. "Grasping Curriculum").
     num_stationary: int = 200  # N_st
@@ -187,6 +191,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "grasp_updates": (0, math.inf),
     "min_failure_loss": (0, math.inf),
     "background_weight": (0, math.inf),
+    "offline_grasp_updates": (0, math.inf),
     "num_stationary": (1, math.inf),
     "min_attempts_to_update": (1, math.inf),
     "num_start": (1, math.inf),

@@ -21,6 +21,7 @@ from relmm.policies.relmm.grasping import GraspEnsemble, RectifiedBackbone
 _CELLS = 7
 _ROWS, _COLUMNS = 30, 31
 _NEAR_ROWS = 1  # pixels of the map before the grasp area
+_PLACES = 8  # of a picture that teach what no attempt has shown, where nobody will try them
 _BANDS = 3  # strips across the map, each as wide as the camera sees the floor there
 NOTICED = 64  # of 255, graspability from which on something is in view
 _HEADS = 8
@@ -96,24 +97,26 @@ class FloorObserver(nn.Module):
     def background_loss(
         self, images: Tensor, grasping: GraspEnsemble, rng: torch.Generator, offline: bool = False
     ) -> Tensor:
-        """How graspable a random place in each picture seems, the mean; summed over the members.
+        """How graspable a random place in each picture seems, the mean over pictures; summed over the members.
 
         No attempt is ever made at walls or furniture, so the network that draws the map would answer there as it
         pleases. Nearly all places are empty; the few that are not look like what attempts have taught. This loss lets
         them be (Ghosh et al. 2017: with wrong labels, the absolute error): cross-entropy would teach, for as long as
         it is learned, that what is far is no thing to grasp. A robot that learns while it acts finds out about what is
-        in reach, so places beyond it are enough, and the map's member. `offline`, who recorded the data may never have
-        failed, and all members learn from all places.
+        in reach, so a place beyond it is enough, and the map's member. `offline`, who recorded the data may never have
+        failed, and all members learn from several places anywhere, each as much as that one.
         """
         assert isinstance(grasping.backbone, RectifiedBackbone)
         everywhere, beyond = self._places
         places = everywhere if offline else beyond
+        if offline:
+            images = images.repeat_interleave(_PLACES, dim=0)
         chosen = places[torch.randint(len(places), (len(images),), generator=rng)].to(images.device)
         rows, columns = chosen[:, :, None].unbind(1)
         patch = torch.arange(2 * self._margin + 1, device=images.device)
         grid = self.view.grid[(rows + patch)[:, :, None], (columns + patch)[:, None, :]]
         logits = grasping.backbone.on_map(self.view.at(images, grid), members=None if offline else 1)
-        return logits.sigmoid().flatten(1).mean(dim=1).sum()
+        return logits.sigmoid().flatten(1).mean(dim=1).sum() * (_PLACES if offline else 1)
 
 
 def _rectangle(known: Tensor, first: int, last: int) -> tuple[slice, slice]:

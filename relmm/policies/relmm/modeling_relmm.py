@@ -32,6 +32,7 @@ class ReLMMPolicy(ControllerPolicy):
         navigation: soft actor-critic.
         sampling: whether it acts as while training; `config.sample` at first.
         estimate: the ensemble's opinion of the last picture; None before the first.
+        updates: of the navigation, or by `forward`, since its first weights.
     """
 
     config_class = ReLMMConfig
@@ -48,6 +49,8 @@ class ReLMMPolicy(ControllerPolicy):
         self.rng = torch.Generator().manual_seed(config.seed or 0)
         self.sampling = config.sample
         self.estimate: Estimate | None = None
+        self.updates: Tensor
+        self.register_buffer("updates", torch.tensor(0))
         # Of the frames that `forward` has seen.
         self._maps, self._recollection = Maps(self.observer, self.grasping, CAPACITY), Recollection()
 
@@ -119,6 +122,8 @@ class ReLMMPolicy(ControllerPolicy):
     def forward(self, batch: dict[str, Any], **kwargs: Any) -> tuple[Tensor, dict[str, Any] | None]:
         """The losses of the frames of a LeRobot batch: attempts teach the ensemble, navigation steps the navigation.
 
+        While training, the ensemble learns first and then the navigation: see `ReLMMConfig.offline_grasp_updates`.
+
         Args:
             batch: pictures (batch, time, 3, 100, 100) 0..1, `action` (batch, history + time, 5) and `next.reward`
                 (batch,), where time is `config.observation_delta_indices`; which of them are padding.
@@ -129,6 +134,8 @@ class ReLMMPolicy(ControllerPolicy):
         if self.training:
             attempts = memory.top_up(attempts, self.config.grasp_batch_size, self.rng)
             steps = memory.top_up(steps, self.config.navigation_batch_size, self.rng)
+            grasps_first = int(self.updates) < self.config.offline_grasp_updates
+            attempts, steps = (attempts, steps[:0]) if grasps_first else (attempts[:0], steps)
 
         def find(frames: NDArray[np.int64]) -> Tensor:
             return self._on_device(memory.pictures_of(frames)) / 255
@@ -179,7 +186,8 @@ class ReLMMPolicy(ControllerPolicy):
     def update(self) -> None:
         """Called after each step of the optimiser."""
         self.navigation.update_targets()
-        self._maps.version += 1
+        self.updates += 1
+        self._maps.version = min(int(self.updates), self.config.offline_grasp_updates)
 
     def get_optim_params(self) -> Any:
         """One group for the ensemble and one for the navigation, with their learning rates."""

@@ -59,6 +59,7 @@ def certain(make_policy_of: MakePolicy, set_logits) -> MakePolicy:
 
 # Batches of LeRobot's are large enough, and are learned from as they are.
 PLAIN = {"grasp_batch_size": 1, "navigation_batch_size": 1, "mirror": False, "recolour": False, "tidied_share": 0.0}
+PLAIN |= {"offline_grasp_updates": 0}
 
 
 @pytest.fixture
@@ -464,23 +465,54 @@ def shown(monkeypatch) -> Callable[[ReLMMPolicy], dict[str, list[Any]]]:
     return watch
 
 
-@pytest.mark.parametrize(("training", "steps", "attempts"), [(True, [4, 4], [3, 3]), (False, [1], [1, 1])])
+@pytest.mark.parametrize("grasp_updates", [0, 2])
 def test_forward_tops_up_small_batches_with_what_earlier_ones_showed(
-    training, steps, attempts, make_policy_of: MakePolicy, draw, shown
+    grasp_updates: int, make_policy_of: MakePolicy, draw, shown
 ) -> None:
     """Loading is slow; to learn twice from what was loaded is not. What is new is always there."""
-    policy = make_policy_of(**PLAIN | {"grasp_batch_size": 3, "navigation_batch_size": 4})
-    policy.train(training)
+    sizes = {"grasp_batch_size": 20, "navigation_batch_size": 30, "offline_grasp_updates": grasp_updates}
+    policy = make_policy_of(**PLAIN | sizes).train()
     seen, episode = shown(policy), make_episode(draw, *"ddfds")
     for frames in ([0, 2], [1, 3, 4]):
-        policy.forward(as_batch(policy, episode, frames if training or frames[0] else [2]))
-    assert [len(pictures) for pictures in seen["grasping"]] == attempts
-    assert [len(batch.rewards) for batch in seen["navigation"]] == steps
-    new = [policy.observer(policy.to_pictures(episode[frame][0]), policy.grasping)[0] for frame in (0, 1, 3)]
-    last = seen["navigation"][-1].observations
-    assert torch.equal(last[0], new[1] if training else new[2])
-    assert torch.equal(seen["grasping"][-1][0], policy.to_pictures(episode[4][0])[0])
-    assert not training or any(torch.equal(each, new[0]) for each in last[2:])
+        policy.forward(as_batch(policy, episode, frames))
+    pictures = [policy.to_pictures(picture)[0] for picture, _, _ in episode]
+    if grasp_updates:
+        assert seen["navigation"] == []
+        assert [len(batch) for batch in seen["grasping"]] == [20, 20]
+        assert torch.equal(seen["grasping"][1][0], pictures[4])
+        assert any(torch.equal(each, pictures[2]) for each in seen["grasping"][1][1:])
+    else:
+        assert seen["grasping"] == []
+        assert [len(batch.rewards) for batch in seen["navigation"]] == [30, 30]
+        maps = [policy.observer(picture[None], policy.grasping)[0] for picture in pictures]
+        assert torch.equal(seen["navigation"][1].observations[0], maps[1])
+        assert any(torch.equal(each, maps[0]) for each in seen["navigation"][1].observations[2:])
+
+
+def test_forward_learns_to_grasp_and_then_to_navigate(make_policy_of: MakePolicy, draw, tmp_path: Path) -> None:
+    """Also if it goes on from a checkpoint. Navigation learns from maps that are no longer changing."""
+    policy = make_policy_of(**PLAIN | {"offline_grasp_updates": 2}).train()
+    learned = []
+    for _ in range(4):
+        optimizer = torch.optim.Adam(policy.get_optim_params())
+        loss, logs = policy.forward(as_batch(policy, make_episode(draw, *"dfds"), range(4)))
+        loss.backward()
+        optimizer.step()
+        policy.update()
+        learned.append((set(logs) & {"grasp_loss", "critic_loss"}).pop())
+        policy.save_pretrained(tmp_path)
+        policy = ReLMMPolicy.from_pretrained(tmp_path).train()
+    assert learned == ["grasp_loss", "grasp_loss", "critic_loss", "critic_loss"]
+
+
+def test_forward_judges_both_while_it_does_not_train(make_policy_of: MakePolicy, draw, shown) -> None:
+    """Each frame that LeRobot holds out, and no other."""
+    policy = make_policy_of(**PLAIN | {"grasp_batch_size": 3, "navigation_batch_size": 4})
+    seen, episode = shown(policy), make_episode(draw, *"ddfds")
+    for frames in ([2], [1, 3, 4]):
+        policy.forward(as_batch(policy, episode, frames))
+    assert [len(pictures) for pictures in seen["grasping"]] == [1, 1]
+    assert [len(batch.rewards) for batch in seen["navigation"]] == [1]
 
 
 def test_forward_waits_until_it_knows_what_came_of_a_step(make_policy_of: MakePolicy, draw, shown) -> None:
