@@ -45,7 +45,7 @@ ROOMS = {
     # Rugs, shadows and furniture take longer to tell from things than an even floor does.
     "obstacles_rugs": (
         "--dataset.num_episodes=70",
-        "--steps=2500 --policy.offline_grasp_updates=1400 --policy.background_weight=1",
+        "--steps=3000 --policy.offline_grasp_updates=2000 --policy.background_weight=1",
     ),
 }
 COLUMNS = ("room", "policy", "training_seed", "updates", *EpisodeScore.__dataclass_fields__)
