@@ -143,9 +143,9 @@ def plot(rows: list[dict[str, str]]) -> None:
     figure, panels = plt.subplots(1, len(ROOMS), figsize=(10, 4), sharey=True, layout="constrained")
     for axes, room in zip(panels, ROOMS, strict=True):
         for (where, name, seed), curve in curves(rows).items():
-            share = [collected(scores).mean() for scores in curve.values()]
             if where != room:
                 continue
+            share = [collected(scores).mean() for scores in curve.values()]
             if name == "relmm":
                 axes.plot(list(curve), share, marker="o", label=f"relmm, seed {seed}")
             else:

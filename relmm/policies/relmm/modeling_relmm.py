@@ -187,6 +187,7 @@ class ReLMMPolicy(ControllerPolicy):
         """Called after each step of the optimiser."""
         self.navigation.update_targets()
         self.updates += 1
+        # From then on the ensemble stays as it is, and so do its maps.
         self._maps.version = min(int(self.updates), self.config.offline_grasp_updates)
 
     def get_optim_params(self) -> Any:

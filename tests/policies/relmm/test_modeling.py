@@ -58,8 +58,14 @@ def certain(make_policy_of: MakePolicy, set_logits) -> MakePolicy:
 
 
 # Batches of LeRobot's are large enough, and are learned from as they are.
-PLAIN = {"grasp_batch_size": 1, "navigation_batch_size": 1, "mirror": False, "recolour": False, "tidied_share": 0.0}
-PLAIN |= {"offline_grasp_updates": 0}
+PLAIN = {
+    "offline_grasp_updates": 0,
+    "grasp_batch_size": 1,
+    "navigation_batch_size": 1,
+    "mirror": False,
+    "recolour": False,
+    "tidied_share": 0.0,
+}
 
 
 @pytest.fixture
