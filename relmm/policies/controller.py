@@ -150,7 +150,17 @@ class ControllerPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> torch.Tensor:
-        """One action a robot, float32 (batch, 5), in the order and units of `relmm.features.ACTION_NAMES`."""
+        """One action a robot, float32 (batch, 5), in the order and units of `relmm.features.ACTION_NAMES`.
+
+        Raises:
+            ConfigError: a state of another length, as `lerobot-rollout` of lerobot 0.6.0 gives it.
+        """
+        if batch[STATE_KEY].shape[-1] != len(STATE_NAMES):  # numbers of other things at the places of those it reads
+            raise ConfigError(
+                f"{STATE_KEY} holds {batch[STATE_KEY].shape[-1]} numbers instead of the {len(STATE_NAMES)} of "
+                f"{', '.join(STATE_NAMES)}; if this is lerobot-rollout of lerobot 0.6.0, which drops velocities, "
+                "install lerobot 0.6.1."
+            )
         images = (batch[IMAGE_KEY] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
         states = batch[STATE_KEY].float().cpu().numpy()
         while len(self._rows) < len(images):

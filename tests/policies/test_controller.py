@@ -114,6 +114,14 @@ def test_it_does_not_learn(kind, make_controller, make_batch, empty) -> None:
         policy.forward(make_batch(empty))
 
 
+def test_a_state_without_velocities_is_refused(kind, make_controller, make_batch, empty) -> None:
+    """As `lerobot-rollout` of lerobot 0.6.0 gives it; the policy would read other numbers than it thinks."""
+    batch = make_batch(empty)
+    batch[STATE_KEY] = batch[STATE_KEY][:, 2:]
+    with pytest.raises(ConfigError, match=r"holds 8 numbers instead of the 10 of x\.vel, .*install lerobot 0\.6\.1"):
+        make_controller(kind).select_action(batch)
+
+
 @pytest.mark.parametrize(
     ("features", "message"),
     [
