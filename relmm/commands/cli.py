@@ -13,6 +13,7 @@ import types
 import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, NoReturn
 
 import draccus
@@ -137,3 +138,9 @@ class StopOnSignal:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous.clear()
+
+
+def dated_folder(kind: str, name: str) -> Path:
+    """outputs/KIND/DATE/TIME_NAME, as LeRobot's commands name their folders."""
+    now = datetime.now()
+    return Path("outputs") / kind / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{name}"

@@ -6,7 +6,6 @@ import json
 import sys
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
-from relmm.commands.cli import progress, run
+from relmm.commands.cli import dated_folder, progress, run
 from relmm.commands.policies import make_actor, policy_from_path, take_seed
 from relmm.commands.thoughts import describe_action, grasp_map
 from relmm.errors import ConfigError
@@ -71,9 +70,7 @@ class EvalConfig:
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}, but must not be negative.")
         if self.output_dir is None:
-            now = datetime.now()
-            name = f"{now:%Y-%m-%d}/{now:%H-%M-%S}_{self.env.room}_{self.policy.type}"
-            self.output_dir = Path("outputs/eval") / name
+            self.output_dir = dated_folder("eval", f"{self.env.room}_{self.policy.type}")
         if self.output_dir.exists():
             raise ConfigError(f"{self.output_dir} exists already: choose another --output_dir.")
 

@@ -64,7 +64,7 @@ class Run:
     def __init__(self, config: TrainConfig, signals: StopOnSignal) -> None:
         assert isinstance(config.policy, ReLMMConfig)
         self.config, self.signals = config, signals
-        self.saved_config = draccus.encode(config, TrainConfig)  # as it was given, for a resume
+        self.saved_config = draccus.encode(config)  # as it was given, for a resume
         self.checkpoint = last_checkpoint(config.checkpoints) if config.resume else None
         if self.checkpoint is not None:
             check_same_networks(self.checkpoint, config.policy.fingerprint())

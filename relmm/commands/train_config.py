@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
+from relmm.commands.cli import dated_folder
 from relmm.commands.policies import policy_from_path
 from relmm.commands.upload import LICENSE
 from relmm.episodes import check_repo_id
@@ -193,8 +193,7 @@ class TrainConfig:
         if self.output_dir is None:
             if self.resume:
                 raise ConfigError("Say which run to go on with: --resume=true --output_dir=FOLDER.")
-            now = datetime.now()
-            self.output_dir = Path("outputs/train") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{self.job_name}"
+            self.output_dir = dated_folder("train", str(self.job_name))
         if not self.resume and self.output_dir.exists():
             raise ConfigError(
                 f"{self.output_dir} exists already: choose another --output_dir, or go on with --resume=true."

@@ -13,7 +13,7 @@ from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, STATS, TASKS,
 from relmm.episodes.repair import RepairReport, repair
 from relmm.episodes.settings import add_run, check_new, check_resume, features_to_store
 from relmm.errors import DatasetError
-from relmm.features import FPS
+from relmm.features import DEPTH_KEY, FPS
 
 # Tasks before the data that refers to them, and the counters of info.json when everything else is there.
 PUBLISHING_ORDER = (TASKS, DATA_FILES, EPISODE_FILES, STATS, INFO)
@@ -223,6 +223,10 @@ def _resume_staged(folder: DatasetFolder, repo_id: str) -> Any:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     last = folder.files(EPISODE_FILES)[-1:]
+    if not last:  # lerobot 0.6.0 would look for the missing files on the Hub
+        info = folder.read_json(INFO)
+        assert info is not None  # repaired
+        return _create_staged(folder, repo_id, DEPTH_KEY in info["features"], info["robot_type"])
     for name in [INFO, *(name for name in (STATS, TASKS, *last) if (folder.root / name).is_file())]:
         (folder.staging / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(folder.root / name, folder.staging / name)
