@@ -40,7 +40,7 @@ COMMANDS = [
     ("records by the scripted teleoperator", f"lerobot-record {ROBOT} --teleop.type=locobot_scripted "
      "--dataset.repo_id=me/teleop --dataset.root=teleop --dataset.single_task=Clean --dataset.num_episodes=1 "
      "--dataset.fps=2 --dataset.episode_time_s=3 --dataset.reset_time_s=0 --dataset.video=false "
-     f"--dataset.push_to_hub=false --dataset.no_stamp=true {QUIET}", "teleop/meta/info.json"),
+     f"--dataset.push_to_hub=false {QUIET}", "teleop/meta/info.json"),
     ("replays an episode", f"lerobot-replay {ROBOT} {DATASET} --dataset.episode=0 {QUIET}", None),
     ("trains, and evaluates in the room", f"lerobot-train {TRAINING} --steps=2 --save_freq=2 --env_eval_freq=2 "
      f"{EVALUATION} --output_dir=trained", f"{TRAINED}/model.safetensors"),

@@ -47,7 +47,6 @@ def test_lerobot_record_with_scripted_teleoperator(run, tmp_path):
         "--dataset.reset_time_s=0",
         "--dataset.video=false",
         "--dataset.push_to_hub=false",
-        "--dataset.no_stamp=true",
         "--play_sounds=false",
     )
     assert result.returncode == 0, result.stderr
