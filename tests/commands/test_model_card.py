@@ -31,7 +31,7 @@ def settings(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["relmm-train"])
     robot, policy = LocobotSimConfig(room="diverse", camera="d435"), ReLMMConfig(device="cpu", camera="d435")
     config = TrainConfig(robot=robot, policy=policy, seed=5, output_dir=tmp_path / "run")
-    return json.loads(json.dumps(draccus.encode(config, TrainConfig)))
+    return json.loads(json.dumps(draccus.encode(config)))
 
 
 DATASET = UploadedDataset("me/life", "abc123", 9)
