@@ -86,7 +86,7 @@ class Learner:
 
     def _grasp_loss(self) -> tuple[torch.Tensor, dict[str, float]]:
         attempts = self.replay.attempts
-        rows = self.replay.sample_attempts(self.config.grasp_batch_size, self.config.success_share, self.rng)
+        rows = self.replay.sample(attempts, self.config.grasp_batch_size, self.rng)
         device = self.policy.weights_device
         pictures = self._pictures(attempts["frame"][rows])
         cells = torch.from_numpy(attempts["cell"][rows]).to(device)

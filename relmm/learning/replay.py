@@ -191,19 +191,6 @@ class Replay:
         """Such rows, uniformly, with replacement, (count,); there must be one."""
         return rng.integers(self._first(table), len(table), count)
 
-    def sample_attempts(self, count: int, success_share: float, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Rows of attempts, with replacement, (count,): this share of successes, or uniformly where it is 0.
-
-        Also uniformly while there is but one kind.
-        """
-        first = self._first(self.attempts)
-        succeeded = self.attempts["success"][first:]
-        kinds = np.flatnonzero(succeeded), np.flatnonzero(~succeeded)
-        if success_share == 0 or min(map(len, kinds)) == 0:
-            return self.sample(self.attempts, count, rng)
-        counts = round(count * success_share), count - round(count * success_share)
-        return first + np.concatenate([rng.choice(kind, n) for kind, n in zip(kinds, counts, strict=True)])
-
     def sample_frames(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Any frames whose pictures are still there, uniformly, with replacement, (count,)."""
         return rng.integers(max(self.frames - self.capacity, 0), self.frames, count)

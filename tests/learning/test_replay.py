@@ -259,28 +259,6 @@ def test_rows_are_sampled_uniformly(fill: Fill) -> None:
     assert ((counts - 200) ** 2 / 200).sum() < 43.8  # chi-squared, 19 degrees of freedom: p = 0.001
 
 
-@pytest.mark.parametrize(("share", "successes"), [(0.5, 30), (0.25, 15), (1.0, 60), (0.0, None)])
-def test_of_a_batch_of_attempts_a_share_succeeded(share: float, successes: int | None, fill: Fill) -> None:
-    """Two of twenty-two attempts; the oldest ones' pictures, a success among them, are gone."""
-    replay = fill(["s", "f" * 10 + "s", "f" * 10 + "s"], capacity=25)
-    alive = replay.attempts["frame"] >= replay.frames - 25
-    rows = np.concatenate([replay.sample_attempts(60, share, np.random.default_rng(seed)) for seed in range(20)])
-    assert alive[rows].all()
-    succeeded = replay.attempts["success"][rows]
-    if successes is None:
-        assert succeeded.mean() == pytest.approx(replay.attempts["success"][alive].mean(), abs=0.02)
-    else:
-        assert succeeded.reshape(20, 60).sum(axis=1).tolist() == [successes] * 20
-    for kind in (True, False)[: 1 + (share < 1)]:
-        expected = np.flatnonzero(alive & (replay.attempts["success"] == kind))
-        assert set(rows[succeeded == kind].tolist()) == set(expected.tolist())
-
-
-def test_attempts_of_one_kind_are_sampled_as_they_are(fill: Fill) -> None:
-    replay = fill(["f" * 20])
-    assert len(replay.sample_attempts(64, 0.5, np.random.default_rng(0))) == 64
-
-
 def test_tables_grow_beyond_their_first_size() -> None:
     table = Table(number=np.int64, half=np.float32)
     for number in range(3000):

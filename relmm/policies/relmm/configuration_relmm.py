@@ -40,8 +40,6 @@ class ReLMMConfig(ControllerConfig):
         grasp_threshold: mean success above which the greedy policy grasps.
         grasp_learning_rate, grasp_batch_size: of the ensemble's optimiser.
         grasp_updates: per attempt.
-        success_share: of the attempts of a batch, how many succeeded; 0 for as they come. Among rugs one in ten does,
-            and an ensemble that nearly always hears no overlooks half of what could be picked up.
         min_failure_loss: until the first success, the ensemble does not learn where its loss is below this: failures
             alone would teach it that nothing can be grasped anywhere, and its members to agree on that.
         background_weight: how much the member that draws the navigation's map learns, from random places beyond reach,
@@ -103,7 +101,6 @@ class ReLMMConfig(ControllerConfig):
     grasp_learning_rate: float = 1e-3
     grasp_batch_size: int = 64
     grasp_updates: int = 4
-    success_share: float = 0.5
     min_failure_loss: float = 0.1
     background_weight: float = 0.3
     offline_grasp_updates: int = 600
@@ -193,7 +190,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "grasp_batch_size": (1, math.inf),
     "grasp_updates": (0, math.inf),
     "min_failure_loss": (0, math.inf),
-    "success_share": (0, 1),
     "background_weight": (0, math.inf),
     "offline_grasp_updates": (0, math.inf),
     "num_stationary": (1, math.inf),

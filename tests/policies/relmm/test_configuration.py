@@ -33,7 +33,6 @@ PAPER: dict[str, Any] = {
     "grasp_updates": 1,
     "min_failure_loss": 0.0,
     "background_weight": 0.0,
-    "success_share": 0.0,
     "freeze_grasping": False,
     # 4.4, Appendix "Grasping Curriculum": N_st, N_bt, N_start, N_stop, N_max.
     "num_stationary": 2000,
