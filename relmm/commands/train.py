@@ -275,6 +275,8 @@ def _train_on_stream(run: Run, root: Path) -> None:
 
     with progress(config.steps, "step", f"following {root}") as bar:
         bar.update(run.progress.steps)
+        if not root.exists():
+            bar.write(f"waiting for {root}, which is not there yet: start its recorder, or check the name")
         run.session(lambda: run.save(read), dict, bar).follow(episodes())
 
 

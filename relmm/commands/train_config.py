@@ -157,6 +157,10 @@ class TrainConfig:
             if getattr(self, name) < least:
                 raise ConfigError(f"{name} is {getattr(self, name)}, but must be at least {least}.")
         if (self.robot is None) == (self.dataset.follow is None):
+            if self.resume and self.robot is None and self.output_dir is not None:  # the run would have said it
+                raise ConfigError(
+                    f"There is no run to go on with in {self.output_dir}: check the folder, or train without --resume."
+                )
             raise ConfigError(
                 "Say what to learn from: either a robot (--robot.type=locobot_sim) or a dataset that another process "
                 "records (--dataset.follow=FOLDER)."

@@ -66,7 +66,8 @@ def check_new(root: Path, repo_id: str) -> None:
     check_repo_id(repo_id)
     if root.exists() or root.is_symlink():
         raise DatasetError(
-            f"{root} exists already and recording never overwrites; choose another folder, or resume this one."
+            f"{root} exists already and recording never overwrites; choose another folder, or go on with this one by "
+            "--resume=true."
         )
 
 

@@ -163,5 +163,9 @@ def test_bad_settings_end_in_one_sentence(tmp_path, refused, arguments, words, t
     assert not folder.exists()
 
 
+def test_no_run_to_resume_is_said_before_what_it_would_have_known(tmp_path, refused):
+    assert "There is no run to go on with" in refused("--resume=true", f"--output_dir={tmp_path / 'typo'}")
+
+
 def test_nothing_to_learn_from_is_refused(tmp_path, refused):
     assert "--robot.type=locobot_sim" in refused("--policy.device=cpu", f"--output_dir={tmp_path / 'run'}")
