@@ -37,6 +37,7 @@ def record(run, root: Path, *extra: str, seed: int = 0, episodes: int = 2):
     )
 
 
+@pytest.mark.timeout(300)  # several commands, one after the other
 def test_record_same_seed_writes_same_dataset(run, tmp_path):
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         result = record(run, tmp_path / name, seed=seed)
@@ -47,6 +48,7 @@ def test_record_same_seed_writes_same_dataset(run, tmp_path):
     assert not np.array_equal(a["action"], c["action"])
 
 
+@pytest.mark.timeout(300)  # several commands, one after the other
 def test_record_prints_summary_read_back_from_files_and_resumes(run, tmp_path):
     root = tmp_path / "room"
     first = record(run, root)
