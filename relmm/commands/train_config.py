@@ -197,7 +197,7 @@ class TrainConfig:
         if self.output_dir is None:
             if self.resume:
                 raise ConfigError("Say which run to go on with: --resume=true --output_dir=FOLDER.")
-            self.output_dir = dated_folder("train", str(self.job_name))
+            self.output_dir = dated_folder("train", self.job_name)
         if not self.resume and self.output_dir.exists():
             raise ConfigError(
                 f"{self.output_dir} exists already: choose another --output_dir, or go on with --resume=true."

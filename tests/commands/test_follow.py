@@ -58,6 +58,7 @@ def test_recorder_and_trainer_work_together(tmp_path):
         recorder.wait(60)
         trainer.kill()
     assert recorder.returncode == 0, (tmp_path / "record.log").read_text()
+    assert f"waiting for {data}, which is not there yet" in (tmp_path / "train.log").read_text()
     assert (tmp_path / "record.log").read_text().count("acting by") >= 3, "new weights are picked up"
     metrics = read_metrics(run / "metrics.jsonl")
     assert metrics[-1]["steps"] >= 60
