@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from relmm.features import Phase
 from relmm.learning.replay import Replay, to_pictures
-from relmm.policies.relmm.batch import NavigationBatch, last_sides, n_step
+from relmm.policies.relmm.batch import NavigationBatch, last_sides
 from relmm.policies.relmm.maps import Maps
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 from relmm.policies.relmm.navigation import ACTIONS
@@ -141,7 +141,6 @@ class Learner:
             torch.from_numpy(chains[name]).to(device) for name in ("success", "attempted", "lengths", "actions")
         )
         rewards, continues = self.policy.rewards(probabilities[:, 1:], success, attempted)
-        rewards, continues = n_step(rewards, continues, ends, self.config.gamma)
         # The motion of a step is that which the frame after it knows of.
         motions = torch.from_numpy(self.replay.motions(frames)).to(device)
         sides, chosen = last_sides(motions[..., 1]), torch.arange(len(frames), device=device)
@@ -154,6 +153,7 @@ class Learner:
             observations[chosen, ends],
             sides[chosen, ends],
             continues,
+            ends,
             motions[:, 1:] * there[..., None],
         )
 

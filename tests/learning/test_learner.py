@@ -190,7 +190,7 @@ def test_navigation_batch_is_that_of_its_frames(relabel: bool, failed: bool, mak
 def test_chain_of_steps_is_one_from_the_first_frame_to_the_last(make_learner, numbered) -> None:
     """With the rewards on the way, relabelled; after the end there is no motion."""
     learner = make_learner("dddds", refreshed_maps=0)
-    policy, gamma = learner.policy, learner.config.gamma
+    policy = learner.policy
     batch = learner.navigation_batch(learner.replay.chains(learner.replay.steps, np.array([0, 2]), 3, 3))
     for row, frames in enumerate([[0, 1, 2, 3], [2, 3, 4]]):
         pictures = to_pictures(np.stack([numbered(frame) for frame in frames]), torch.device("cpu"))
@@ -198,9 +198,9 @@ def test_chain_of_steps_is_one_from_the_first_frame_to_the_last(make_learner, nu
         rewards, going_on = [chance - 1 for chance in chances], [1 - chance for chance in chances]
         if row == 1:
             rewards[-1], going_on[-1] = 0.0, 0.0
-        expected = sum(gamma**k * np.prod(going_on[:k]) * reward for k, reward in enumerate(rewards))
-        assert batch.rewards[row].item() == pytest.approx(expected, rel=1e-4)
-        assert batch.continues[row].item() == pytest.approx(gamma ** (len(rewards) - 1) * np.prod(going_on), rel=1e-4)
+        assert batch.lengths[row] == len(rewards)
+        assert batch.rewards[row, : len(rewards)].tolist() == pytest.approx(rewards, rel=1e-4)
+        assert batch.continues[row, : len(rewards)].tolist() == pytest.approx(going_on, rel=1e-4)
         observations = policy.observer(pictures, policy.grasping).int()
         assert (batch.observations[row].int() - observations[0]).abs().max() <= 1
         assert (batch.next_observations[row].int() - observations[-1]).abs().max() <= 1

@@ -22,9 +22,9 @@ class NavigationBatch:
         sides, next_sides: to which the robot turns where it sees nothing, 1 for the left and -1 for the right,
             (batch,). That of its last turn is taken for it.
         actions: -1..1, (batch, 2).
-        rewards: -1..0 for one step, (batch,).
-        continues: what the next observation's value counts, but for one factor gamma: 1 where the search goes on, 0
-            after a success, or the probability of that, (batch,).
+        rewards: of each step, -1..0, (batch, steps).
+        continues: whether the search goes on after it, 0 after a success, or the probability of that, (batch, steps).
+        lengths: how many steps there are, the others repeat the last one, (batch,).
         motions: of each step by the wheels, m/s and deg/s, 0 where there is none, (batch, steps, 2).
     """
 
@@ -35,6 +35,7 @@ class NavigationBatch:
     next_observations: Tensor
     next_sides: Tensor
     continues: Tensor
+    lengths: Tensor
     motions: Tensor
 
     def mirrored(self) -> NavigationBatch:
@@ -59,8 +60,14 @@ class NavigationBatch:
         empty = torch.rand(count, generator=rng) / _NOT_ALL
         empty[torch.rand(count, generator=rng) >= share] = 0.0
         empty = empty.to(self.rewards.device)
-        before, after = tidy(self.observations, self.next_observations, self.motions, empty, rng)
-        return replace(self, observations=before, next_observations=after)
+        before, after, nothing = tidy(self.observations, self.next_observations, self.motions, empty, rng)
+        return replace(
+            self,
+            observations=before,
+            next_observations=after,
+            rewards=self.rewards.masked_fill(nothing, -1.0),
+            continues=self.continues.masked_fill(nothing, 1.0),
+        )
 
     def recoloured(self, rng: torch.Generator) -> NavigationBatch:
         """The same in another light, both maps in the same; for maps of the floor.

@@ -237,10 +237,11 @@ class ReLMMPolicy(ControllerPolicy):
             observations[:count],
             sides[:, 0],
             self._on_device(steps["action"]),
-            rewards,
+            rewards[:, None],
             observations[count:],
             sides[:, 1],
-            continues,
+            continues[:, None],
+            torch.ones(count, dtype=torch.long, device=self.weights_device),
             self._on_device(steps["motion"])[:, None],
         )
 

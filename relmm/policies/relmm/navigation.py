@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
-from relmm.policies.relmm.batch import NavigationBatch
+from relmm.policies.relmm.batch import NavigationBatch, n_step
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.encoders import NOTICED, Encoder
 
@@ -155,7 +155,8 @@ class Navigation(nn.Module):
         """R + gamma * (1 - terminal) * (min Q'(o', a') - temperature * log pi(a'|o')), (batch,)."""
         actions, log_density = self._sample(batch.next_observations, batch.next_sides, noise)
         values = self.targets(self.targets.encode(batch.next_observations), actions).amin(dim=0)
-        targets = batch.rewards + self.config.gamma * batch.continues * (values - temperature * log_density)
+        rewards, continues = n_step(batch.rewards, batch.continues, batch.lengths, self.config.gamma)
+        targets = rewards + self.config.gamma * continues * (values - temperature * log_density)
         return targets.clamp(-1 / (1 - self.config.gamma), 0.0) if self.config.clip_targets else targets
 
     @torch.no_grad()

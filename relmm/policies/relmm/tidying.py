@@ -9,17 +9,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from relmm.features import DRIVE_PULSE_S, GRASP_X
+from relmm.features import DRIVE_PULSE_S, GRASP_X, GRASP_Y
 from relmm.policies.relmm.encoders import FloorObserver, map_places
 
 _PATCH = 0.3  # m, side of the squares of floor that are empty or are not
 _PATCHES = 24  # more than the map reaches, in a row
-_KEPT = 0.3  # m from the grasp area's middle; what lies there before or after a step may have been its success
+_AREA = complex(sum(GRASP_X) / 2, sum(GRASP_Y) / 2)  # m, its middle
+_NEAR = 0.13  # m round it, that is empty as a whole or not at all
 
 
 def tidy(
     maps: Tensor, next_maps: Tensor, motions: Tensor, empty: Tensor, rng: torch.Generator
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """The maps before and after navigation steps, without what lay on a random part of the floor.
 
     What is gone is gone from both. Colours stay: averaged over a pixel, small things hardly show in them.
@@ -32,27 +33,35 @@ def tidy(
         rng: chooses the squares.
 
     Returns:
-        Like `maps` and `next_maps`.
+        Like `maps` and `next_maps`; and whether the grasp area lay on an empty part after each step, so that there was
+        nothing to pick up, bool, (batch, steps).
     """
     device, count = maps.device, len(maps)
     here = torch.complex(*map_places()).flatten().to(device)  # forward + i * left in the robot's frame, m
-    moved, turned = (each[:, None] for each in _odometry(motions))
+    moved, turned = _odometry(motions)
     emptied = torch.rand(count, _PATCHES**2, generator=rng).to(device) < empty[:, None]
     corners = torch.rand(2, count, 1, generator=rng).to(device) + _PATCHES // 2
 
-    def without(each: Tensor, before: Tensor, after: Tensor) -> Tensor:
-        """A map without what lies on empty squares; where its pixels are, in the robot's frames before and after."""
-        near = torch.minimum(*(_squared(places - sum(GRASP_X) / 2) for places in (before, after))) < _KEPT**2
+    def is_empty(places: Tensor) -> Tensor:
+        """Whether places, forward + i * left in the frame before the steps, (batch, n), lie on empty squares."""
         rows, columns = (
             (axis / _PATCH + corner).long().clamp(0, _PATCHES - 1)
-            for axis, corner in zip((before.real, before.imag), corners, strict=True)
+            for axis, corner in zip((places.real, places.imag), corners, strict=True)
         )
-        gone = emptied.gather(1, rows * _PATCHES + columns) & ~near
+        return emptied.gather(1, rows * _PATCHES + columns)
+
+    reached = _AREA * turned + moved
+    nothing = is_empty(reached)
+
+    def without(each: Tensor, places: Tensor) -> Tensor:
+        """A map without what lies on empty squares; where its pixels are, in the frame before the steps."""
+        near = _squared(places - reached[:, -1:]) < _NEAR**2
+        gone = torch.where(near, nothing[:, -1:], is_empty(places))
         graspable = each[:, :1] * ~gone.view(count, 1, *FloorObserver.shape[1:])
         return torch.cat([graspable, each[:, 1:]], dim=1)
 
-    before = without(maps, here.expand(count, -1), (here - moved) * turned.conj())
-    return before, without(next_maps, here * turned + moved, here.expand(count, -1))
+    before = without(maps, here.expand(count, -1))
+    return before, without(next_maps, here * turned[:, -1:] + moved[:, -1:]), nothing
 
 
 def _squared(places: Tensor) -> Tensor:
@@ -61,8 +70,8 @@ def _squared(places: Tensor) -> Tensor:
 
 
 def _odometry(motions: Tensor) -> tuple[Tensor, Tensor]:
-    """Where steps lead, forward + i * left in m, and how far round, e^(i * angle), (batch,) each."""
+    """Where steps lead, forward + i * left in m, and how far round, e^(i * angle), after each, (batch, steps)."""
     forward, turns = motions[..., 0] * DRIVE_PULSE_S, motions[..., 1].deg2rad() * DRIVE_PULSE_S
     headings = turns.cumsum(dim=1)
-    moved = torch.polar(forward, headings - turns / 2).sum(dim=1)
-    return moved, torch.polar(torch.ones_like(forward[:, 0]), headings[:, -1])
+    moved = torch.polar(forward, headings - turns / 2).cumsum(dim=1)
+    return moved, torch.polar(torch.ones_like(forward), headings)

@@ -16,9 +16,12 @@ def make_batch() -> NavigationBatch:
     rng = torch.Generator().manual_seed(1)
     observations, following = torch.randint(0, 256, (2, SIZE, *FloorObserver.shape), dtype=torch.uint8, generator=rng)
     sides, next_sides = torch.tensor([[1.0, -1, 1, -1, 1], [-1, -1, 1, 1, 1]])
-    actions, (rewards, continues) = torch.rand(SIZE, 2, generator=rng) * 2 - 1, torch.rand(2, SIZE, generator=rng)
+    actions, (rewards, continues) = torch.rand(SIZE, 2, generator=rng) * 2 - 1, torch.rand(2, SIZE, 3, generator=rng)
     motions = torch.rand(SIZE, 3, 2, generator=rng) - 0.5
-    return NavigationBatch(observations, sides, actions, rewards - 1, following, next_sides, continues, motions)
+    lengths = torch.tensor([1, 2, 3, 3, 1])
+    return NavigationBatch(
+        observations, sides, actions, rewards - 1, following, next_sides, continues, lengths, motions
+    )
 
 
 def test_mirrored_batch_exchanges_left_and_right_and_nothing_else() -> None:

@@ -365,10 +365,11 @@ def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, succes
         observations[:1],
         torch.ones(1),
         from_navigation_steps(torch.tensor([list(DRIVE.values())])),
-        torch.tensor([0.0 if success else chance - 1]),
+        torch.tensor([[0.0 if success else chance - 1]]),
         observations[1:],
         -torch.ones(1),
-        torch.tensor([0.0 if success else 1 - chance]),
+        torch.tensor([[0.0 if success else 1 - chance]]),
+        torch.tensor([1]),
         torch.tensor([[DRIVEN]]),
     )
 
@@ -528,9 +529,9 @@ def test_forward_waits_until_it_knows_what_came_of_a_step(make_policy_of: MakePo
     loss, logs = policy.forward(as_batch(policy, episode, [1]))
     assert (loss.item(), logs) == (0.0, {})
     policy.forward(as_batch(policy, episode, [2, 0]))
-    assert seen["navigation"][-1].rewards.tolist() != [0.0], "the second drive is waiting for the second attempt"
+    assert seen["navigation"][-1].rewards.tolist() != [[0.0]], "the second drive is waiting for the second attempt"
     policy.forward(as_batch(policy, episode, [3]))
-    assert seen["navigation"][-1].rewards.tolist() == [0.0]
+    assert seen["navigation"][-1].rewards.tolist() == [[0.0]]
     assert len(seen["navigation"]) == 2
 
 

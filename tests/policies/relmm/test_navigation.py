@@ -61,9 +61,10 @@ def make_batch(kind: str = "floor") -> NavigationBatch:
     actions = torch.rand(SIZE, 2, dtype=torch.double, generator=rng) * 2 - 1
     sides, next_sides = torch.tensor([[1, -1, 1, -1, 1], [-1, -1, 1, 1, 1]]).double()
     motions = torch.rand(SIZE, 3, 2, dtype=torch.double, generator=rng) - 0.5
-    rewards = torch.tensor([-1.0, 0.0, -0.4, -1.0, -0.9], dtype=torch.double)
-    continues = torch.tensor([1, 0, 0.6, 1, 1.0]).double()
-    return NavigationBatch(observations, sides, actions, rewards, following, next_sides, continues, motions)
+    rewards = torch.tensor([[-1.0], [0.0], [-0.4], [-1.0], [-0.9]], dtype=torch.double)
+    continues = torch.tensor([[1], [0], [0.6], [1], [1.0]]).double()
+    lengths = torch.ones(SIZE, dtype=torch.long)
+    return NavigationBatch(observations, sides, actions, rewards, following, next_sides, continues, lengths, motions)
 
 
 def make_noise() -> Tensor:
@@ -107,7 +108,7 @@ def targets_at(navigation: Navigation, batch: NavigationBatch, noise: Tensor) ->
     actions, log_density = act_at(navigation, after(batch), noise)
     first, second = values_at(navigation.targets, after(batch), actions)
     value = torch.minimum(first, second) - navigation.log_temperature.exp() * log_density
-    return batch.rewards + navigation.config.gamma * batch.continues * value
+    return batch.rewards[:, 0] + navigation.config.gamma * batch.continues[:, 0] * value
 
 
 def critic_loss(navigation: Navigation, batch: NavigationBatch, targets: Tensor) -> Tensor:
@@ -199,7 +200,7 @@ def test_encoder_of_the_floor_is_trained_by_the_critics_alone(make_navigation: M
     for head in navigation.critics.heads:
         nn.init.zeros_(head[-1].weight)
         nn.init.zeros_(head[-1].bias)
-    batch.rewards, batch.continues = torch.zeros(2, SIZE, dtype=torch.double)
+    batch.rewards, batch.continues = torch.zeros(2, SIZE, 1, dtype=torch.double)
     navigation.loss(batch, noise)[0].backward()
     assert not learned(navigation.critics.parameters())
     assert learned(navigation.actor.parameters())
@@ -218,7 +219,7 @@ def test_targets_take_the_smaller_value_and_add_entropy(make_navigation: MakeNav
     navigation, batch, noise = make_navigation(gamma=0.9, clip_targets=False), make_batch(), make_noise()
     constant(navigation, -3.0, -5.0)
     log_density = act_at(navigation, after(batch), noise[1])[1].tolist()
-    rows = zip(batch.rewards.tolist(), batch.continues.tolist(), log_density, strict=True)
+    rows = zip(batch.rewards[:, 0].tolist(), batch.continues[:, 0].tolist(), log_density, strict=True)
     expected = [reward + 0.9 * continues * (-5.0 - 0.1 * density) for reward, continues, density in rows]
     targets = navigation.bellman_targets(batch, noise[1], torch.tensor(0.1, dtype=torch.double))
     assert targets.tolist() == pytest.approx(expected)
@@ -229,7 +230,7 @@ def test_targets_take_the_smaller_value_and_add_entropy(make_navigation: MakeNav
 @pytest.mark.parametrize(("value", "expected"), [(100.0, 0.0), (-100.0, -10.0)])
 def test_targets_stay_within_what_rewards_allow(value: float, expected: float, make_navigation) -> None:
     batch, noise, temperature = make_batch(), make_noise(), torch.tensor(0.1, dtype=torch.double)
-    batch.continues = torch.ones(SIZE, dtype=torch.double)
+    batch.continues = torch.ones(SIZE, 1, dtype=torch.double)
     clipped, free = (make_navigation(gamma=0.9, clip_targets=clip) for clip in (True, False))
     for navigation in (clipped, free):
         constant(navigation, value, value)
@@ -371,4 +372,4 @@ def test_actor_learns_by_the_turns_that_are_made(make_navigation: MakeNavigation
     first, second = values_at(navigation.targets, before(batch), following)
     value = torch.minimum(first, second) - 0.1 * next_density
     targets = navigation.bellman_targets(batch, noise[1], torch.tensor(0.1, dtype=torch.double))
-    assert torch.allclose(targets, batch.rewards + navigation.config.gamma * batch.continues * value)
+    assert torch.allclose(targets, batch.rewards[:, 0] + navigation.config.gamma * batch.continues[:, 0] * value)
