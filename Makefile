@@ -34,7 +34,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (less than 15 minutes)
 	$(BIN)/relmm-train --robot.type=locobot_sim --robot.room=no_obstacles --dataset.repo_id=demo/no_obstacles \
-	  --steps=$(DEMO_STEPS) --seed=0 --output_dir=$(DEMO_DIR)/train
+	  --steps=$(DEMO_STEPS) --env_eval_freq=250 --seed=0 --output_dir=$(DEMO_DIR)/train
 # An untrained robot grasps at everything: 40 navigation steps of that are enough to see.
 	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/000000/pretrained_model --env.room=no_obstacles \
 	  --env.navigation_steps=40 --eval.n_episodes=1 --seed=0 --output_dir=$(DEMO_DIR)/before

@@ -20,7 +20,8 @@ def main() -> None:
     parser.add_argument("after", type=Path, help="another one")
     parser.add_argument("film", type=Path, help="mp4 to write")
     arguments = parser.parse_args()
-    beside(arguments.before / _EPISODE, arguments.after / _EPISODE, arguments.film)
+    films = {"before learning": arguments.before / _EPISODE, "after learning": arguments.after / _EPISODE}
+    beside({f"{title}, at four times its speed": film for title, film in films.items()}, arguments.film)
     print(f"before and after: {arguments.film}")
 
 

@@ -124,6 +124,14 @@ class Run:
             self.saved_config,
         )
 
+    def bar(self, title: str) -> Any:
+        """A progress bar of all navigation steps, those before a resume included."""
+        done, steps = self.progress.steps, self.config.steps
+        bar = progress(steps, "step", title, initial=done)
+        if done >= steps:
+            bar.write(f"this run has gone {done} navigation steps already; a --steps above that goes on with it")
+        return bar
+
     def session(self, save: Callable[[], None], evaluate: Callable[[], dict[str, Any]], bar: Any) -> Session:
         """The loop with everything around it."""
         config = self.config
@@ -206,8 +214,7 @@ def _train_on_robot(run: Run) -> None:
                 recorder.flush()
                 run.save(recorder.saved_episodes)
 
-            with progress(config.steps, "step", "training") as bar:
-                bar.update(run.progress.steps)
+            with run.bar("training") as bar:
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
     if _recorded(config.dataset_root):
         print(summarize(config.dataset_root))
@@ -273,8 +280,7 @@ def _train_on_stream(run: Run, root: Path) -> None:
             if not batch:
                 time.sleep(_POLL_S)
 
-    with progress(config.steps, "step", f"following {root}") as bar:
-        bar.update(run.progress.steps)
+    with run.bar(f"following {root}") as bar:
         if not root.exists():
             bar.write(f"waiting for {root}, which is not there yet: start its recorder, or check the name")
         run.session(lambda: run.save(read), dict, bar).follow(episodes())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fractions import Fraction
 from itertools import zip_longest
 from pathlib import Path
@@ -56,28 +57,38 @@ class Scene:
         self._renderer.close()
 
 
-def beside(first: Path, second: Path, path: Path) -> None:
+def beside(films: Mapping[str, Path], path: Path) -> None:
     """Put two films of equal height beside each other; the shorter one stands still at its end.
 
     Args:
-        first: mp4 file, on the left.
-        second: another one, on the right.
+        films: mp4 files, from left to right, by their titles.
         path: of the new one.
     """
     import av
 
+    first, second = films.values()
     with av.open(str(first)) as left, av.open(str(second)) as right, av.open(str(path), mode="w") as output:
         rate = left.streams.video[0].average_rate
         stream = output.add_stream("libx264", rate=rate, options={"crf": "23"})
-        stream.width = left.streams.video[0].width + right.streams.video[0].width
-        stream.height, stream.pix_fmt = left.streams.video[0].height, "yuv420p"
+        widths = [film.streams.video[0].width for film in (left, right)]
+        titles = np.hstack([_title(title, width) for title, width in zip(films, widths, strict=True)])
+        stream.width, stream.height = sum(widths), len(titles) + left.streams.video[0].height
+        stream.pix_fmt = "yuv420p"
         shown: list[Any] = [None, None]
         for pair in zip_longest(left.decode(video=0), right.decode(video=0)):
             shown = [
                 old if new is None else new.to_ndarray(format="rgb24") for new, old in zip(pair, shown, strict=True)
             ]
-            output.mux(stream.encode(av.VideoFrame.from_ndarray(np.hstack(shown), format="rgb24")))
+            picture = np.vstack([titles, np.hstack(shown)])
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         output.mux(stream.encode())
+
+
+def _title(text: str, width: int) -> NDArray[np.uint8]:
+    """A strip to put above a film, uint8 (32, width, 3)."""
+    strip = np.full((32, width, 3), 24, np.uint8)
+    cv2.putText(strip, text, (10, 22), _FONT, 0.6, (235, 235, 235), 1, cv2.LINE_AA)
+    return strip
 
 
 class Film:

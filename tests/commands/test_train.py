@@ -90,6 +90,8 @@ def test_resume_goes_on_with_all_recorded_steps(tmp_path, tiny):
     drives = sum(np.count_nonzero((s == Skill.NAVIGATE) & (p == Phase.LEARNING)) for s, p in skills)
     curriculum = sum(np.count_nonzero((s == Skill.GRASP) & (p == Phase.CURRICULUM)) for s, p in skills)
     assert (drives, curriculum) == (8, 6), "steps of before count, and the curriculum is not done twice"
+    result = train("--resume=true", f"--output_dir={folder}", "--steps=8", "--policy.device=cpu")
+    assert "this run has gone 8 navigation steps already" in result.stderr + result.stdout
 
 
 @pytest.mark.slow

@@ -20,13 +20,16 @@ def write(path, grey: int, pictures: int) -> None:
 def test_films_side_by_side_last_as_long_as_the_longer(tmp_path):
     write(tmp_path / "dark.mp4", 30, 5)
     write(tmp_path / "light.mp4", 200, 9)
-    beside(tmp_path / "dark.mp4", tmp_path / "light.mp4", tmp_path / "both.mp4")
+    beside({"I": tmp_path / "dark.mp4", "": tmp_path / "light.mp4"}, tmp_path / "both.mp4")
     with av.open(str(tmp_path / "both.mp4")) as film:
         pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(pictures) == 9
     for picture in pictures:
+        strip, picture = np.vsplit(picture, [len(picture) - 48])
         assert abs(picture[:, :60].mean() - 30) < 10
         assert abs(picture[:, 68:].mean() - 200) < 10
+        assert strip[:, :60].max() > 150, "its title"
+        assert strip[:, 68:].max() < 60, "has none"
 
 
 def test_scene_shows_the_inset():
