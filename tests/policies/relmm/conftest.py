@@ -15,10 +15,12 @@ from relmm.geometry import camera_geometry
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.grasping import DenseBackbone, GraspEnsemble, RectifiedBackbone
+from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 
 DENSE = {"grasp_backbone": "dense", "navigation_encoder": "paper_small"}
 
 MakeConfig = Callable[..., ReLMMConfig]
+MakePolicy = Callable[..., ReLMMPolicy]
 
 
 @pytest.fixture(scope="session")
@@ -85,3 +87,20 @@ def draw() -> Callable[..., NDArray[np.uint8]]:
 def noise_pictures() -> Callable[[int], Tensor]:
     """Pictures of nothing, 0..1, (count, 3, 100, 100)."""
     return lambda count: torch.rand(count, 3, 100, 100, generator=torch.Generator().manual_seed(count))
+
+
+@pytest.fixture
+def make_policy_of(make_config) -> MakePolicy:
+    return lambda *backbone, **settings: ReLMMPolicy(make_config(*backbone, **settings)).eval()
+
+
+@pytest.fixture
+def make_green(make_policy_of: MakePolicy, see_green) -> MakePolicy:
+    """Builds a policy that wants to grasp what is green."""
+
+    def make(**settings: object) -> ReLMMPolicy:
+        policy = make_policy_of(seed=3, **settings)
+        see_green(policy.grasping, [15.0, 20.0, 25.0])
+        return policy
+
+    return make
