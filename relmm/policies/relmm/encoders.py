@@ -177,13 +177,13 @@ class Encoder(nn.Module):
         self.on_floor = kind == "floor"
         if self.on_floor:
             self.keypoints = Keypoints()
-            self.embed = nn.Sequential(nn.Linear(Keypoints.features, _POINT_FEATURES), nn.ReLU())
+            self.embed = nn.Sequential(nn.Linear(Keypoints.features, _POINT_FEATURES), nn.ReLU(inplace=True))
         with torch.no_grad():
             self.features: int = self(torch.zeros(1, *shape)).shape[1]
 
     def forward(self, observations: Tensor) -> Tensor:
         """Features, (batch, features), of uint8 observations, (batch, channels, height, width)."""
-        scaled = observations.float() / 127.5 - 1
+        scaled = observations.float().div_(127.5).sub_(1)
         encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))
         return torch.cat([encoded, self.embed(self.keypoints(scaled))], dim=1) if self.on_floor else encoded
 
@@ -205,11 +205,11 @@ def _floor_layers() -> list[nn.Module]:
     convolutions = [
         layer
         for inputs, outputs in pairwise(widths)
-        for layer in (nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU())
+        for layer in (nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU(inplace=True))
     ]
     pixels = widths[-1] * math.ceil(_ROWS / 8) * math.ceil(_COLUMNS / 8)
     features = _CONVOLUTION_FEATURES
-    return [*convolutions, nn.Flatten(), nn.Linear(pixels, features), nn.LayerNorm(features), nn.ReLU()]
+    return [*convolutions, nn.Flatten(), nn.Linear(pixels, features), nn.LayerNorm(features), nn.ReLU(inplace=True)]
 
 
 _LAYERS: dict[str, Any] = {"paper": _paper_layers, "paper_small": _paper_small_layers, "floor": _floor_layers}

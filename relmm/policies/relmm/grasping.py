@@ -155,11 +155,11 @@ def _convolutions(config: ReLMMConfig) -> nn.Sequential:
     width = config.grasp_channels
     net = nn.Sequential(
         nn.Conv2d(3, width, 3),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(width, width, 3),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(width, width, 3),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(width, 1, 3),
     )
     for layer in net:

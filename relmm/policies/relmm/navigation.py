@@ -215,8 +215,8 @@ def _dense_layers(config: ReLMMConfig, inputs: int, outputs: int) -> nn.Sequenti
     """Two hidden layers; the fast preset normalises the first, which keeps small batches stable."""
     hidden = config.navigation_hidden
     normalise = [nn.LayerNorm(hidden)] if config.navigation_encoder == "floor" else []
-    first = [nn.Linear(inputs, hidden), *normalise, nn.ReLU()]
-    return nn.Sequential(*first, nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+    first = [nn.Linear(inputs, hidden), *normalise, nn.ReLU(inplace=True)]
+    return nn.Sequential(*first, nn.Linear(hidden, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, outputs))
 
 
 def to_navigation_step(action: list[float]) -> dict[str, float]:
