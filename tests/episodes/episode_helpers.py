@@ -120,3 +120,10 @@ def check_dataset(root, episodes: int, depth: bool = False) -> None:
     assert len(dataset) == len(expected) == len(dataset.hf_dataset)
     for index, (episode, step) in enumerate(expected):
         check_frame(dataset[index], episode, step, index, depth)
+
+
+def check_episodes(episodes, numbers) -> None:
+    episodes = list(episodes)
+    assert [episode.index for episode in episodes] == list(numbers)
+    for episode in episodes:
+        check_episode(episode, episode.index)
