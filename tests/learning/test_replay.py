@@ -7,31 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from relmm.features import FRONT, GRID, MAX_THETA_VEL, MAX_X_VEL, Phase, Skill, action_dict
+from relmm.features import FRONT, GRID, MAX_THETA_VEL, MAX_X_VEL, Phase, action_dict
 from relmm.learning.replay import Replay, Table, to_pictures
 from relmm.policies.controller import grasp_cell
 
-# Episodes of drives (d), drives of pseudo-resets (r), attempts that fail (f) or do not (s), and placements (p).
 Life = list[str]
-SKILLS = {"d": Skill.NAVIGATE, "r": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
 Fill = Callable[..., Replay]
-
-
-@pytest.fixture
-def fill(numbered, motion_of, action_of) -> Fill:
-    """A replay of a life, frame by frame."""
-
-    def replay_of(life: Life, capacity: int = 500) -> Replay:
-        replay = Replay(capacity)
-        for episode in life:
-            for kind in episode:
-                phase = Phase.PSEUDO_RESET if kind == "r" else Phase.LEARNING
-                number = replay.frames
-                replay.add(numbered(number), motion_of(number), action_of(SKILLS[kind], number), kind == "s", phase)
-            replay.save_episode()
-        return replay
-
-    return replay_of
 
 
 def random_life(seed: int) -> Life:
@@ -185,7 +166,7 @@ def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> N
     replay = Replay(10)
     lengths = []
     for kind in "dffd":
-        replay.add(numbered(0), (0.0, 0.0), action_of(SKILLS[kind], 0), False, Phase.LEARNING)
+        replay.add(numbered(0), (0.0, 0.0), action_of(kind, 0), False, Phase.LEARNING)
         lengths.append(len(replay.steps))
     assert lengths == [0, 0, 0, 1]
 
