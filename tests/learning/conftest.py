@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,8 @@ from relmm.learning.replay import Replay
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+
+sys.path.insert(0, str(Path(__file__).parent))  # for scripted_world
 
 # Episodes of drives (d), drives of pseudo-resets (r), attempts that fail (f) or do not (s), and placements (p).
 SKILLS = {"d": Skill.NAVIGATE, "r": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
