@@ -6,6 +6,7 @@ import json
 from importlib.resources import files
 from pathlib import Path
 
+from relmm.errors import ConfigError
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 PRESETS = ("fast", "paper", "paper_small")
@@ -29,10 +30,20 @@ def resolve_config_path(arguments: list[str]) -> None:
 
     Args:
         arguments: of the command line; changed in place.
+
+    Raises:
+        ConfigError: they name a preset and a checkpoint, which has its own settings.
     """
     for index, argument in enumerate(arguments):
-        if argument.removeprefix(_OPTION) in PRESETS and argument.startswith(_OPTION):
-            arguments[index] = f"{_OPTION}{preset_path(argument.removeprefix(_OPTION))}"
+        name = argument.removeprefix(_OPTION)
+        if name in PRESETS and argument.startswith(_OPTION):
+            checkpoint = next((a for a in arguments if a.startswith("--policy.path=")), None)
+            if checkpoint is not None:
+                raise ConfigError(
+                    f"{argument} begins a new policy and {checkpoint} goes on with another, by its own settings: leave "
+                    "one of them out."
+                )
+            arguments[index] = f"{_OPTION}{preset_path(name)}"
     folder = next((a.partition("=")[2] for a in arguments if a.startswith("--output_dir=")), None)
     if "--resume=true" in arguments and folder and not any(a.startswith(_OPTION) for a in arguments):
         stored = Path(folder) / "checkpoints" / "last" / "pretrained_model" / "train_config.json"

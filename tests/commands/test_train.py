@@ -165,6 +165,14 @@ def test_bad_settings_end_in_one_sentence(tmp_path, refused, arguments, words, t
     assert not folder.exists()
 
 
+@pytest.mark.parametrize("preset", ["fast", "paper", "paper_small"])
+def test_preset_and_checkpoint_together_are_refused(tmp_path, refused, tiny, preset):
+    """Which of the two policies was meant?"""
+    both = (f"--config_path={preset}", "--policy.path=me/cleaner")
+    kept = [argument for argument in tiny if not argument.startswith("--policy.")]
+    assert "leave one of them out" in refused(*kept, *both, f"--output_dir={tmp_path / 'run'}")
+
+
 def test_no_run_to_resume_is_said_before_what_it_would_have_known(tmp_path, refused):
     assert "There is no run to go on with" in refused("--resume=true", f"--output_dir={tmp_path / 'typo'}")
 
