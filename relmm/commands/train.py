@@ -271,13 +271,13 @@ def _train_on_stream(run: Run, root: Path) -> None:
     def episodes() -> Iterator[Any]:
         nonlocal read
         while not run.signals.stopped:
-            batch = follower.poll()
-            for episode in batch:
+            before = read
+            for episode in follower.read_new():
                 read = episode.index + 1
                 yield episode
                 if run.signals.stopped:
                     return
-            if not batch:
+            if read == before:
                 time.sleep(_POLL_S)
 
     with run.bar(f"following {root}") as bar:

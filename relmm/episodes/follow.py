@@ -99,16 +99,19 @@ class EpisodeFollower:
     """
 
     def __init__(self, root: Path | str, first: int = 0) -> None:
-        """Reads nothing yet.
+        """Reads no episode yet.
 
         Args:
             root: the dataset; it need not exist yet.
             first: number of the first episode to read.
+
+        Raises:
+            DatasetError: it exists, and is none that relmm can train on.
         """
         self.next = first
         self.problem = ""
         self._folder = DatasetFolder(root)
-        self._data_path: str | None = None
+        self._data_path = self._find_data_path()
         self._last_episodes: dict[str, int] = {}  # number of the last one, by file of meta/episodes
 
     def poll(self) -> list[Episode]:

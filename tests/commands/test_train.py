@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -175,6 +176,19 @@ def test_preset_and_checkpoint_together_are_refused(tmp_path, refused, tiny, pre
 
 def test_no_run_to_resume_is_said_before_what_it_would_have_known(tmp_path, refused):
     assert "There is no run to go on with" in refused("--resume=true", f"--output_dir={tmp_path / 'typo'}")
+
+
+@pytest.mark.parametrize("option", ["follow", "init"])
+def test_dataset_that_cannot_be_trained_on_is_refused(tmp_path, refused, finished, tiny, option):
+    data, folder = tmp_path / "data", tmp_path / "run"
+    shutil.copytree(finished / "dataset", data)
+    info = json.loads((data / "meta/info.json").read_text())
+    del info["features"]["next.reward"]
+    (data / "meta/info.json").write_text(json.dumps(info))
+    learner = [argument for argument in tiny if option == "init" or not argument.startswith("--robot.")]
+    words = refused(*learner, f"--dataset.{option}={data}", f"--output_dir={folder}")
+    assert "column next.reward: have no such column" in words
+    assert not folder.exists()
 
 
 def test_nothing_to_learn_from_is_refused(tmp_path, refused):

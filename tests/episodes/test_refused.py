@@ -46,11 +46,19 @@ def test_other_datasets_are_refused_before_anything_is_read(tmp_path, change, wo
     new_dataset(tmp_path / "d", 1)
     check_trainable(tmp_path / "d")
     edit_info(tmp_path / "d", change)
-    for read in (check_trainable, read_episodes, lambda root: EpisodeFollower(root).poll()):
+    for read in (check_trainable, read_episodes, EpisodeFollower):
         with pytest.raises(DatasetError, match=words) as caught:
             read(tmp_path / "d")
         assert str(caught.value).startswith(str(tmp_path / "d"))
         assert "; choose " in str(caught.value)
+
+
+def test_another_dataset_is_refused_when_it_comes(tmp_path):
+    follower = EpisodeFollower(tmp_path / "d")
+    new_dataset(tmp_path / "d", 1)
+    edit_info(tmp_path / "d", lambda info: info.update(fps=30))
+    with pytest.raises(DatasetError, match="fps: have 30"):
+        follower.poll()
 
 
 def test_more_columns_are_welcome(tmp_path):
