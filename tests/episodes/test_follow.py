@@ -172,7 +172,7 @@ def test_a_kill_between_the_renames_of_a_save(tmp_path, forkserver, done):
     seen = follower.poll()
     process = forkserver.Process(target=die_after_renames, args=(root, 1, done))
     process.start()
-    process.join(60)
+    process.join()
     assert process.exitcode == -signal.SIGKILL
     seen += follower.poll()
     assert len(seen) == (3 if done >= 2 else 2)

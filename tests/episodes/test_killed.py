@@ -29,7 +29,7 @@ PROJECT = Path(__file__).parents[2]
 def run(forkserver, function, *arguments):
     process = forkserver.Process(target=function, args=arguments)
     process.start()
-    process.join(60)
+    process.join()
     return process.exitcode
 
 
