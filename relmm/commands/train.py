@@ -265,25 +265,22 @@ def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
 def _train_on_stream(run: Run, root: Path) -> None:
     config = run.config
     run.load_data()
-    read = _recorded(root) if config.resume else 0
-    follower = EpisodeFollower(root, read)
+    follower = EpisodeFollower(root, _recorded(root) if config.resume else 0)
 
     def episodes() -> Iterator[Any]:
-        nonlocal read
         while not run.signals.stopped:
-            before = read
+            before = follower.next
             for episode in follower.read_new():
-                read = episode.index + 1
                 yield episode
                 if run.signals.stopped:
                     return
-            if read == before:
+            if follower.next == before:
                 time.sleep(_POLL_S)
 
     with run.bar(f"following {root}") as bar:
         if not root.exists():
             bar.write(f"waiting for {root}, which is not there yet: start its recorder, or check the name")
-        run.session(lambda: run.save(read), dict, bar).follow(episodes())
+        run.session(lambda: run.save(follower.next), dict, bar).follow(episodes())
 
 
 def main() -> None:

@@ -10,6 +10,8 @@ from relmm.features import DEPTH_KEY, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phase, 
 REPO_ID = "tester/clean_room"
 INFO = {"room": "no_obstacles", "camera": "paper", "seed": 3}
 TASK = "tidy the room"
+DATA = "data/chunk-000/file-{:03d}.parquet"
+META = "meta/episodes/chunk-000/file-{:03d}.parquet"
 
 
 def length_of(episode: int) -> int:

@@ -11,7 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from episode_children import die_after_renames, record_without_end
 from episode_helpers import (
+    DATA,
     INFO,
+    META,
     REPO_ID,
     TASK,
     arguments,
@@ -34,9 +36,6 @@ from relmm.episodes import (
 from relmm.episodes.folder import DatasetFolder
 from relmm.errors import DatasetError
 from relmm.features import FPS, dataset_features
-
-DATA = "data/chunk-000/file-{:03d}.parquet"
-META = "meta/episodes/chunk-000/file-{:03d}.parquet"
 
 
 def test_what_was_recorded_comes_back(tmp_path):

@@ -9,13 +9,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from episode_helpers import check_episode, check_episodes, new_dataset
+from episode_helpers import DATA, check_episode, check_episodes, new_dataset
 
 from relmm.episodes import EpisodeFollower, check_trainable, read_episodes
 from relmm.errors import DatasetError
 from relmm.features import IMAGE_KEY
-
-DATA = "data/chunk-000/file-{:03d}.parquet"
 
 
 def edit_info(root, change):

@@ -5,13 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
-from episode_helpers import REPO_ID, TASK, arguments, check_dataset, length_of, load, new_dataset, record
+from episode_helpers import DATA, META, REPO_ID, TASK, arguments, check_dataset, length_of, load, new_dataset, record
 
 from relmm.episodes import DurableDataset, FrameBuilder, verify_and_repair
 from relmm.errors import DatasetError
-
-DATA = "data/chunk-000/file-{:03}.parquet"
-META = "meta/episodes/chunk-000/file-{:03}.parquet"
 
 
 def truncate(path):

@@ -80,15 +80,15 @@ class NavigationBatch:
         offset = _OFFSET * _plus_minus_1((count, 3, 1, 1), rng)
 
         def other(maps: Tensor) -> Tensor:
-            noise = _plus_minus_1((count, 3, *maps.shape[2:]), rng).mul_(_NOISE)
-            colours = (maps[:, 1:] * gain.to(device)).add_(noise.add_(offset).to(device))
-            return torch.cat([maps[:, :1], colours.clamp_(0, 255).to(torch.uint8)], dim=1)
+            noise = _NOISE * _plus_minus_1((count, 3, *maps.shape[2:]), rng)
+            colours = maps[:, 1:] * gain.to(device) + (offset + noise).to(device)
+            return torch.cat([maps[:, :1], colours.clamp(0, 255).to(torch.uint8)], dim=1)
 
         return replace(self, observations=other(self.observations), next_observations=other(self.next_observations))
 
 
 def _plus_minus_1(shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
-    return torch.rand(shape, generator=rng).mul_(2).sub_(1)
+    return torch.rand(shape, generator=rng) * 2 - 1
 
 
 def last_sides(theta_vels: Tensor) -> Tensor:

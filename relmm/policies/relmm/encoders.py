@@ -183,7 +183,7 @@ class Encoder(nn.Module):
 
     def forward(self, observations: Tensor) -> Tensor:
         """Features, (batch, features), of uint8 observations, (batch, channels, height, width)."""
-        scaled = observations.float().div_(127.5).sub_(1)
+        scaled = observations.float() / 127.5 - 1
         encoded: Tensor = self.layers(scaled.contiguous(memory_format=torch.channels_last))
         return torch.cat([encoded, self.embed(self.keypoints(scaled))], dim=1) if self.on_floor else encoded
 
