@@ -105,14 +105,16 @@ def test_killed_run_resumes(tmp_path, max_steps, tiny):
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    deadline = time.monotonic() + 90
+    deadline = time.monotonic() + 180
     while not (folder / "checkpoints" / "000004").exists():
         assert time.monotonic() < deadline
         assert process.poll() is None
         time.sleep(0.05)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    time.sleep(1)  # the writer process finishes what it has received
+    while (folder / "dataset" / "images" / ".lock").exists():  # the writer process finishes what it has received
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
     before = recorded(folder / "dataset")
     steps = json.loads((folder / "checkpoints" / "last" / "training_state" / "training_step.json").read_text())["step"]
     result = train("--resume=true", f"--output_dir={folder}", f"--steps={steps + 8}", "--policy.device=cpu")
