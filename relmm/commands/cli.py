@@ -46,6 +46,9 @@ def run[Config](
     except (RelmmError, OSError) as error:
         print(f"{command}: {_sentence(error)}", file=sys.stderr)
         sys.exit(_USAGE_ERROR)
+    except KeyboardInterrupt:
+        print(f"{command}: interrupted.", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
 
 
 def _register_plugins() -> None:

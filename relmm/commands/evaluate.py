@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
@@ -104,9 +105,9 @@ class EpisodeScore:
     metres: float
 
     def row(self) -> list[float]:
-        """The values of `_COLUMNS`."""
-        objects = max(self.collected, 1)
-        share = self.picked_up / max(self.grasps, 1)
+        """The values of `_COLUMNS`; NaN is what none of something took."""
+        objects = self.collected or math.nan
+        share = self.picked_up / (self.grasps or math.nan)
         rates = (self.navigation_steps / objects, self.seconds / objects)
         return [self.collected / self.total, self.picked_up, self.grasps, share, *rates, self.metres]
 
@@ -177,12 +178,13 @@ def _robot_observation(observation: dict[str, Any]) -> dict[str, Any]:
 
 
 def table(scores: list[EpisodeScore]) -> str:
-    """A row an episode, then mean and standard deviation."""
-    rows = np.array([score.row() for score in scores])
+    """A row an episode, then mean and standard deviation over the episodes that have a value."""
+    rows = np.ma.masked_invalid([score.row() for score in scores])
     lines = ["  ".join(f"{name:>13}" for name in ("seed", *_COLUMNS))]
     labels = [*(str(score.seed) for score in scores), "mean", "std"]
     for label, row in zip(labels, [*rows, rows.mean(axis=0), rows.std(axis=0)], strict=True):
-        values = [f"{row[0]:.1%}", f"{row[1]:.1f}", f"{row[2]:.1f}", f"{row[3]:.1%}", *(f"{v:.1f}" for v in row[4:])]
+        formats = (".1%", ".1f", ".1f", ".1%", ".1f", ".1f", ".1f")
+        values = ["-" if v is np.ma.masked else format(v, f) for v, f in zip(row, formats, strict=True)]
         lines.append("  ".join(f"{value:>13}" for value in (label, *values)))
     return "\n".join(lines)
 

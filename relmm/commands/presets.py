@@ -32,7 +32,7 @@ def resolve_config_path(arguments: list[str]) -> None:
         arguments: of the command line; changed in place.
 
     Raises:
-        ConfigError: they name a preset and a checkpoint, which has its own settings.
+        ConfigError: no such file, or a preset and a checkpoint, which has its own settings.
     """
     for index, argument in enumerate(arguments):
         name = argument.removeprefix(_OPTION)
@@ -44,6 +44,8 @@ def resolve_config_path(arguments: list[str]) -> None:
                     "one of them out."
                 )
             arguments[index] = f"{_OPTION}{preset_path(name)}"
+        elif argument.startswith(_OPTION) and not Path(name).is_file():
+            raise ConfigError(f"{argument}: there is no such file; choose one, or a preset: {', '.join(PRESETS)}.")
     folder = next((a.partition("=")[2] for a in arguments if a.startswith("--output_dir=")), None)
     if "--resume=true" in arguments and folder and not any(a.startswith(_OPTION) for a in arguments):
         stored = Path(folder) / "checkpoints" / "last" / "pretrained_model" / "train_config.json"

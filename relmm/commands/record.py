@@ -15,7 +15,7 @@ from relmm.commands.policies import FreshWeights, make_actor, policy_from_path, 
 from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
-from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, summarize
+from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, saved_episodes, summarize
 from relmm.errors import ConfigError
 from relmm.learning.actor import Actor
 from relmm.learning.collect import Collector
@@ -102,7 +102,7 @@ def record(config: RecordConfig) -> None:
     if config.dataset.push_to_hub:
         check_dataset_upload(config.dataset.repo_id, config.dataset.private, config.resume)
     # A resumed recording goes on with other random numbers than it began with.
-    seed = config.seed + (summarize(root).episodes if config.resume and root.exists() else 0)
+    seed = config.seed + (saved_episodes(root) if config.resume else 0)
     take_seed(config.policy, seed)
     assert config.policy is not None
     actor = make_actor(config.policy)
@@ -111,6 +111,9 @@ def record(config: RecordConfig) -> None:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         with _recorder(config, root, robot) as recorder:
             _collect(config, robot, actor, recorder, seed, signals)
+    if saved_episodes(root) == 0:
+        print(f"no episode was recorded; --resume=true goes on in {root}")
+        return
     print(summarize(root))
     if config.dataset.push_to_hub:
         settings = config.dataset

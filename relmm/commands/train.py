@@ -27,6 +27,7 @@ from relmm.episodes import (
     check_trainable,
     local_root,
     read_episodes,
+    saved_episodes,
     summarize,
 )
 from relmm.learning.checkpoint import (
@@ -98,7 +99,7 @@ class Run:
                 self._read(root, "reading the run's own dataset", update_from=cursor, count=True)
 
     def _read(self, root: Path, title: str, update_from: int | None, count: bool = False) -> None:
-        with progress(_recorded(root), "episode", title, leave=False) as bar:
+        with progress(saved_episodes(root), "episode", title, leave=False) as bar:
             for episode in read_episodes(root):
                 update = update_from is not None and episode.index >= update_from
                 self.learner.read(episode, update)
@@ -174,7 +175,8 @@ def train(config: TrainConfig) -> None:
             _train_on_robot(run)
     assert config.output_dir is not None
     draw_learning_curve(config.output_dir / "metrics.jsonl", config.output_dir / "learning_curve.png")
-    print(f"checkpoints, metrics, dataset and learning_curve.png: {config.output_dir}")
+    kept = "checkpoints, metrics" if config.robot is None else "checkpoints, metrics, dataset"
+    print(f"{kept} and learning_curve.png: {config.output_dir}")
     run.uploads.say = print
     run.uploads.finish()
 
@@ -185,7 +187,7 @@ def _train_on_robot(run: Run) -> None:
     if not config.resume:
         check_new(config.dataset_root, config.dataset.repo_id)
     run.load_data()
-    seed = config.seed + (_recorded(config.dataset_root) if config.resume else 0)
+    seed = config.seed + (saved_episodes(config.dataset_root) if config.resume else 0)
     robot = make_locobot(replace(config.robot), seed, "relmm-train")
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
@@ -216,13 +218,8 @@ def _train_on_robot(run: Run) -> None:
 
             with run.bar("training") as bar:
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
-    if _recorded(config.dataset_root):
+    if saved_episodes(config.dataset_root):
         print(summarize(config.dataset_root))
-
-
-def _recorded(root: Path) -> int:
-    """Episodes of a dataset, 0 if none has been saved yet."""
-    return summarize(root).episodes if any(root.glob("data/*/*.parquet")) else 0
 
 
 def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:
@@ -265,7 +262,7 @@ def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
 def _train_on_stream(run: Run, root: Path) -> None:
     config = run.config
     run.load_data()
-    follower = EpisodeFollower(root, _recorded(root) if config.resume else 0)
+    follower = EpisodeFollower(root, saved_episodes(root) if config.resume else 0)
 
     def episodes() -> Iterator[Any]:
         while not run.signals.stopped:

@@ -159,11 +159,12 @@ class TrainConfig:
         if (self.robot is None) == (self.dataset.follow is None):
             if self.resume and self.robot is None and self.output_dir is not None:  # the run would have said it
                 raise ConfigError(
-                    f"There is no run to go on with in {self.output_dir}: check the folder, or train without --resume."
+                    f"There is no run to go on with in {self.output_dir}, which has no checkpoints/last: check the "
+                    "folder, or train into another one without --resume."
                 )
             raise ConfigError(
                 "Say what to learn from: either a robot (--robot.type=locobot_sim) or a dataset that another process "
-                "records (--dataset.follow=FOLDER)."
+                "records (--dataset.follow=FOLDER), not both."
             )
         camera = getattr(self.robot, "camera", self.policy.camera)
         if camera != self.policy.camera:

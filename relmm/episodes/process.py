@@ -89,7 +89,7 @@ def _carry_out(dataset: DurableDataset, name: str, arguments: list[Any]) -> None
 def _receive(commands: Connection) -> tuple[Any, ...] | None:
     try:
         return commands.recv()
-    except (EOFError, ConnectionResetError):
+    except (EOFError, OSError):  # also one that was killed in the middle of a message
         return None
 
 

@@ -95,6 +95,11 @@ def summarize(root: Path | str) -> DatasetSummary:
     )
 
 
+def saved_episodes(root: Path | str) -> int:
+    """How many episodes a dataset has; none if its recording ended before the first was saved."""
+    return summarize(root).episodes if DatasetFolder(root).files(DATA_FILES) else 0
+
+
 def _read(folder: DatasetFolder, files: list[str]) -> dict[str, NDArray[Any]]:
     tables = []
     for name in files:

@@ -54,6 +54,29 @@ def test_evaluate_films_the_arm_too(run, tmp_path):
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
 
 
+def test_what_took_nothing_has_no_rate():
+    nothing = command.EpisodeScore(1, 0, 20, 0, 0, 0, 250, 100.0, 20.0)
+    half = command.EpisodeScore(2, 10, 20, 20, 10, 10, 250, 100.0, 20.0)
+    rows = [line.split() for line in command.table([nothing, half]).splitlines()[1:]]
+    assert rows[0] == ["1", "0.0%", "0.0", "0.0", "-", "-", "-", "20.0"]
+    assert rows[1] == ["2", "50.0%", "10.0", "20.0", "50.0%", "25.0", "10.0", "20.0"]
+    assert rows[2] == ["mean", "25.0%", "5.0", "10.0", "50.0%", "25.0", "10.0", "20.0"]
+    assert [line.split()[4] for line in command.table([nothing]).splitlines()[1:]] == ["-", "-", "-"]
+
+
+def test_evaluate_interrupted_says_so(capsys, monkeypatch, tmp_path):
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "evaluate", interrupted)
+    arguments = ["relmm-eval", "--policy.type=relmm_random", f"--output_dir={tmp_path / 'out'}"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "relmm-eval: interrupted.\n"
+
+
 @pytest.mark.parametrize(
     ("bad", "message"),
     [

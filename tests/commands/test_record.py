@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from relmm.episodes import summarize
+from relmm.episodes import saved_episodes, summarize
 from relmm.features import ACTION_NAMES, Phase
 
 SIM = ("--robot.type=locobot_sim", "--robot.room=no_obstacles", "--dataset.repo_id=me/room")
@@ -107,6 +107,33 @@ def test_record_stopped_by_signal_saves_and_finishes(tmp_path, number):
     assert f"episodes        {summary.episodes}" in output
     assert summary.episodes >= 3
     assert summary.truncated + summary.ended_by_success == summary.episodes, "the cut-off episode is marked truncated"
+
+
+@pytest.mark.timeout(300)  # several commands, one after the other
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_record_ended_before_its_first_episode_goes_on(run, tmp_path, number):
+    root = tmp_path / "room"
+    script = Path(sys.executable).parent / "relmm-record"
+    arguments = (*SIM, "--policy.type=relmm_random", f"--dataset.root={root}", "--dataset.num_episodes=2")
+    with subprocess.Popen(
+        [str(script), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while not (root / "meta/info.json").exists():
+            assert process.poll() is None
+            time.sleep(0.001)
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=100)
+    assert "Traceback" not in errors
+    saved = saved_episodes(root)
+    assert saved == 0 or number == signal.SIGINT
+    if number == signal.SIGINT:
+        assert process.returncode == 0, errors
+        assert (f"episodes        {saved}" if saved else "no episode was recorded; --resume=true") in output
+    while (root / "images/.lock").exists():  # the writer process may outlive the killed one
+        time.sleep(0.05)
+    result = record(run, root, "--resume=true", episodes=1)
+    assert result.returncode == 0, result.stderr
+    assert summarize(root).episodes == saved + 1
 
 
 @pytest.mark.parametrize(

@@ -176,6 +176,11 @@ def test_preset_and_checkpoint_together_are_refused(tmp_path, refused, tiny, pre
     assert "leave one of them out" in refused(*kept, *both, f"--output_dir={tmp_path / 'run'}")
 
 
+def test_config_path_that_is_neither_file_nor_preset_is_refused(tmp_path, refused, tiny):
+    words = refused(*tiny, "--config_path=nonsense", f"--output_dir={tmp_path / 'run'}")
+    assert "--config_path=nonsense: there is no such file; choose one, or a preset: fast, paper, paper_small." in words
+
+
 def test_no_run_to_resume_is_said_before_what_it_would_have_known(tmp_path, refused):
     assert "There is no run to go on with" in refused("--resume=true", f"--output_dir={tmp_path / 'typo'}")
 

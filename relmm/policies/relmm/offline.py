@@ -53,7 +53,7 @@ class Batch:
     """
 
     def __init__(self, batch: dict[str, Any]) -> None:
-        if "next.reward" not in batch:
+        if not isinstance(batch.get("next.reward"), Tensor):  # LeRobot puts in the number 0 where there is no column
             raise ConfigError("The dataset has no column next.reward: train relmm from one of relmm-record or -train.")
         pictures = (batch[IMAGE_KEY] * 255).round().to(torch.uint8)  # (batch, time, 3, 100, 100)
         actions, padded = batch["action"].cpu(), _padding(batch, IMAGE_KEY, pictures)
