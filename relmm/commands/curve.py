@@ -31,6 +31,7 @@ def draw_learning_curve(metrics: Path, picture: Path) -> None:
     _draw_training(right, training)
     for axes in (left, right):
         axes.grid(alpha=0.3)
+        axes.set_xlim(left=0)
     figure.savefig(picture, dpi=110)
     plt.close(figure)
 

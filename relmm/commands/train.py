@@ -141,10 +141,12 @@ class Run:
         self.uploads.say = bar.write
 
         def show(status: dict[str, Any]) -> None:
-            curriculum = status["practice_attempts"] if status["steps"] == 0 else None
+            practising = status["steps"] == 0 and status["practice_attempts"] > 0
+            planned = f"/{self.policy.config.num_stationary}" if config.curriculum.type == "stationary" else ""
+            practice = {"curriculum": f"{status['practice_attempts']}{planned} grasps"}
             shown = {"objects": status["objects"], "grasps": f"{status['successes']}/{status['attempts']}"}
             losses = {key: f"{value:.2f}" for key, value in self.learner.logs.items() if key.endswith("_loss")}
-            bar.set_postfix({"curriculum": curriculum} if curriculum else shown | losses, refresh=False)
+            bar.set_postfix(practice if practising else shown | losses, refresh=False)
             bar.update(status["steps"] - bar.n)
             self.uploads.check()
 
