@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from numpy.typing import NDArray
 
 import relmm.plugin  # noqa: F401
 from relmm.commands.evaluate import EpisodeScore, run_episode
@@ -35,6 +36,14 @@ def evaluate(config: PreTrainedConfig, room: str, seeds: range) -> list[EpisodeS
     return scores
 
 
+def rates(scores: list[EpisodeScore]) -> tuple[NDArray[np.floating], float, float]:
+    """What each episode collected, how many attempts were successful, and judged rightly by the robot, all in %."""
+    grasps, lifted = sum(score.grasps for score in scores), sum(score.picked_up for score in scores)
+    wrong = sum(abs(score.picked_up - score.picked_up_judged) for score in scores)
+    share = 100 * np.array([score.collected / score.total for score in scores])
+    return share, 100 * lifted / grasps, 100 * (1 - wrong / grasps)
+
+
 def main() -> None:
     """Print a table and write a CSV with a row an episode."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -49,12 +58,9 @@ def main() -> None:
     for policy in POLICIES:
         for room in ROOMS:
             scores = evaluate(POLICIES[policy](device="cpu"), room, seeds)
-            share = 100 * np.array([score.collected / score.total for score in scores])
-            grasps, lifted = sum(score.grasps for score in scores), sum(score.picked_up for score in scores)
-            wrong = sum(abs(score.picked_up - score.picked_up_judged) for score in scores)
+            share, success, judged = rates(scores)
             print(
-                f"{policy:16}{room:16}{share.mean():9.1f} ± {share.std():4.1f}{100 * lifted / grasps:15.1f}%"
-                f"{100 * (1 - wrong / grasps):13.1f}%",
+                f"{policy:16}{room:16}{share.mean():9.1f} ± {share.std():4.1f}{success:15.1f}%{judged:13.1f}%",
                 flush=True,
             )
             rows += [(policy, room, *score.__dict__.values()) for score in scores]

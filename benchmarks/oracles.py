@@ -15,8 +15,8 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
+from baselines import rates
 from lerobot.configs.policies import PreTrainedConfig
 from privileged_controller import graspable
 from torch import Tensor, nn
@@ -129,16 +129,14 @@ def main() -> None:
     if arguments.output.exists():
         kept = list(csv.reader(arguments.output.open(newline="")))[1:]
         rows += [tuple(row) for row in kept if row[0] != arguments.room]
-    print(f"{'room':16}{'replaced':20}{'collected':>18}{'grasps':>8}{'successful':>12}{'judged right':>14}")
+    print(f"{'room':16}{'replaced':20}{'collected':>18}{'successful':>12}{'judged right':>14}")
     for swap in arguments.swaps:
         by_policy = [evaluate(folder, arguments.room, swap, seeds) for folder in arguments.policies]
         scores = [score for scores in by_policy for score in scores]
-        share = 100 * np.array([score.collected / score.total for score in scores])
-        grasps, lifted = sum(score.grasps for score in scores), sum(score.picked_up for score in scores)
-        wrong = sum(abs(score.picked_up - score.picked_up_judged) for score in scores)
+        share, success, judged = rates(scores)
         print(
             f"{arguments.room:16}{swap:20}{share.mean():8.1f} ± {share.std() / len(share) ** 0.5:3.1f} s.e."
-            f"{grasps / len(scores):8.1f}{100 * lifted / grasps:11.0f}%{100 * (1 - wrong / grasps):13.1f}%",
+            f"{success:11.0f}%{judged:13.1f}%",
             flush=True,
         )
         rows += [

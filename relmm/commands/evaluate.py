@@ -24,7 +24,15 @@ from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
 from relmm.sim.env import SUCCESS_SHARE, RelmmRoomEnv
 from relmm.sim.film import Film
 
-_COLUMNS = ("collected", "picked up", "grasps", "grasp success", "steps/object", "s/object", "metres")
+_COLUMNS = {  # and their formats
+    "collected": ".1%",
+    "picked up": ".1f",
+    "grasps": ".1f",
+    "grasp success": ".1%",
+    "steps/object": ".1f",
+    "s/object": ".1f",
+    "metres": ".1f",
+}
 
 
 @dataclass
@@ -183,8 +191,7 @@ def table(scores: list[EpisodeScore]) -> str:
     lines = ["  ".join(f"{name:>13}" for name in ("seed", *_COLUMNS))]
     labels = [*(str(score.seed) for score in scores), "mean", "std"]
     for label, row in zip(labels, [*rows, rows.mean(axis=0), rows.std(axis=0)], strict=True):
-        formats = (".1%", ".1f", ".1f", ".1%", ".1f", ".1f", ".1f")
-        values = ["-" if v is np.ma.masked else format(v, f) for v, f in zip(row, formats, strict=True)]
+        values = ["-" if v is np.ma.masked else format(v, f) for v, f in zip(row, _COLUMNS.values(), strict=True)]
         lines.append("  ".join(f"{value:>13}" for value in (label, *values)))
     return "\n".join(lines)
 

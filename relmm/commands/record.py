@@ -111,7 +111,7 @@ def record(config: RecordConfig) -> None:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         with _recorder(config, root, robot) as recorder:
             _collect(config, robot, actor, recorder, seed, signals)
-    if saved_episodes(root) == 0:
+    if recorder.saved_episodes == 0:
         print(f"no episode was recorded; --resume=true goes on in {root}")
         return
     print(summarize(root))

@@ -141,12 +141,13 @@ class Run:
         self.uploads.say = bar.write
 
         def show(status: dict[str, Any]) -> None:
-            practising = status["steps"] == 0 and status["practice_attempts"] > 0
-            planned = f"/{self.policy.config.num_stationary}" if config.curriculum.type == "stationary" else ""
-            practice = {"curriculum": f"{status['practice_attempts']}{planned} grasps"}
-            shown = {"objects": status["objects"], "grasps": f"{status['successes']}/{status['attempts']}"}
-            losses = {key: f"{value:.2f}" for key, value in self.learner.logs.items() if key.endswith("_loss")}
-            bar.set_postfix(practice if practising else shown | losses, refresh=False)
+            if status["steps"] == 0 and status["practice_attempts"] > 0:
+                planned = f"/{self.policy.config.num_stationary}" if config.curriculum.type == "stationary" else ""
+                shown = {"curriculum": f"{status['practice_attempts']}{planned} grasps"}
+            else:
+                shown = {"objects": status["objects"], "grasps": f"{status['successes']}/{status['attempts']}"}
+                shown |= {key: f"{value:.2f}" for key, value in self.learner.logs.items() if key.endswith("_loss")}
+            bar.set_postfix(shown, refresh=False)
             bar.update(status["steps"] - bar.n)
             self.uploads.check()
 
@@ -220,7 +221,7 @@ def _train_on_robot(run: Run) -> None:
 
             with run.bar("training") as bar:
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
-    if saved_episodes(config.dataset_root):
+    if recorder.saved_episodes > 0:
         print(summarize(config.dataset_root))
 
 
