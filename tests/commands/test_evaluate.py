@@ -80,7 +80,7 @@ def test_evaluate_interrupted_says_so(capsys, monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ("--env.room=kitchen", "no_obstacles"),
+        ("--env.room=no_such_room", "no_obstacles"),
         ("--env.navigation_steps=0", "must be at least 1"),
         ("--eval.n_episodes=0", "must be at least 1"),
         ("--eval.n_videos=-1", "must not be negative"),

@@ -139,7 +139,7 @@ def test_record_ended_before_its_first_episode_goes_on(run, tmp_path, number):
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ("--robot.room=kitchen", "diverse, no_obstacles, obstacles, obstacles_rugs"),
+        ("--robot.room=no_such_room", "no_obstacles, obstacles, obstacles_rugs"),
         ("--robot.num_objects=0", "num_objects is 0"),
         ("--robot.num_objects=-3", "num_objects is -3"),
         ("--robot.camera=webcam", "choose one of paper, d435"),

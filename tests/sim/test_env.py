@@ -220,7 +220,7 @@ def test_a_room_of_another_package_works(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize(
-    "setting", [{"navigation_steps": 0}, {"num_objects": 0}, {"room": "kitchen"}, {"camera": "fisheye"}], ids=str
+    "setting", [{"navigation_steps": 0}, {"num_objects": 0}, {"room": "no_such_room"}, {"camera": "fisheye"}], ids=str
 )
 def test_settings_that_cannot_work_are_refused_in_one_sentence(setting: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as error:

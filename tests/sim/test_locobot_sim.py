@@ -97,8 +97,8 @@ def test_a_room_of_another_package_works(registry: None) -> None:
 
 def test_an_unknown_room_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError) as error:
-        LocobotSimConfig(room="kitchen")
-    assert "'kitchen'" in str(error.value)
+        LocobotSimConfig(room="no_such_room")
+    assert "'no_such_room'" in str(error.value)
     assert all(name in str(error.value) for name in ("no_obstacles", "obstacles", "diverse", "obstacles_rugs"))
 
 
