@@ -38,7 +38,8 @@ def evaluate(config: PreTrainedConfig, room: str, seeds: range) -> list[EpisodeS
 
 def rates(scores: list[EpisodeScore]) -> tuple[NDArray[np.floating], float, float]:
     """What each episode collected, how many attempts were successful, and judged rightly by the robot, all in %."""
-    grasps, lifted = sum(score.grasps for score in scores), sum(score.picked_up for score in scores)
+    grasps = sum(score.grasps for score in scores) or np.nan
+    lifted = sum(score.picked_up for score in scores)
     wrong = sum(abs(score.picked_up - score.picked_up_judged) for score in scores)
     share = 100 * np.array([score.collected / score.total for score in scores])
     return share, 100 * lifted / grasps, 100 * (1 - wrong / grasps)

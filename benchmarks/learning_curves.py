@@ -3,7 +3,7 @@
 Each run is a `relmm-train` command with three seeds. Everything was tuned with training seeds from 1000 on and
 evaluation seeds from 50000 on; the runs here train with seeds 0, 1 and 2 and are evaluated on seeds 0 to 9.
 
-    python benchmarks/learning_curves.py --runs fast_stationary --seeds 0 1 2 --jobs 2
+    python benchmarks/learning_curves.py --runs stationary --seeds 0 1 2 --jobs 2
     python benchmarks/learning_curves.py --plot          # draws docs/learning_curves.png from the CSV
 
 Finished runs are kept in --output and not run again.
@@ -38,6 +38,7 @@ COLUMNS = (
     "attempts",
     "pseudo_reset_steps",
     "interventions",
+    "robot_minutes",
     "seconds",
     "command",
 )
@@ -50,15 +51,13 @@ def room(name: str, steps: int, every: int, *options: str) -> str:
 
 
 RUNS = {
-    "fast_stationary": room("no_obstacles", 4000, 1000),
-    "fast_autonomous": room("no_obstacles", 5000, 1000, "--curriculum.type=autonomous"),
-    "fast_obstacles": room("obstacles", 10000, 2000),
-    "fast_diverse": room("diverse", 10000, 2000),
-    "fast_obstacles_rugs": room("obstacles_rugs", 10000, 2000),
+    "stationary": room("no_obstacles", 1, 1),  # the curriculum alone: 100 attempts
+    "autonomous": room("no_obstacles", 300, 100, "--curriculum.type=autonomous"),
+    "d435": room("no_obstacles", 1, 1, "--robot.camera=d435 --policy.camera=d435 --policy.num_stationary=200"),
+    "obstacles": room("obstacles", 500, 500),
+    "diverse": room("diverse", 1000, 500),
+    "obstacles_rugs": room("obstacles_rugs", 4000, 1000),
     "paper_small": room("no_obstacles", 5000, 1000, "--config_path=paper_small"),
-    "no_uncertainty": room("no_obstacles", 5000, 1000, "--policy.std_weight=0 --policy.gate_std_weight=0"),
-    "frozen_grasping": room("no_obstacles", 5000, 1000, "--policy.freeze_grasping=true"),
-    "no_relabel": room("no_obstacles", 5000, 1000, "--policy.relabel=false"),
 }
 
 
@@ -93,6 +92,7 @@ def read(run: str, seed: int, folder: Path) -> list[dict[str, Any]]:
             "attempts": line["attempts"],
             "pseudo_reset_steps": line["pseudo_reset_steps"],
             "interventions": line["interventions"],
+            "robot_minutes": round(line["robot_minutes"], 1),
             "seconds": line["seconds"],
             "command": command,
         }
@@ -115,24 +115,28 @@ def save(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def load(path: Path) -> list[dict[str, str]]:
-    """The rows of the CSV, none if there is no such file."""
+    """The rows of the CSV of runs that there still are, none if there is no such file."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+        return [row for row in csv.DictReader(file) if row["run"] in RUNS and row.get("robot_minutes")]
 
 
 def show(rows: list[dict[str, str]]) -> None:
     """Print a table: a line a run and step, with the mean over seeds and the worst one."""
-    print(f"{'run':22}{'step':>7}{'seeds':>7}{'collected':>11}{'worst':>8}{'grasps':>8}{'interventions':>15}{'s':>7}")
+    print(
+        f"{'run':22}{'step':>7}{'seeds':>7}{'collected':>11}{'worst':>8}{'grasps':>8}{'interventions':>15}"
+        f"{'robot min':>11}{'s':>7}"
+    )
     for run in RUNS:
         for step in sorted({int(row["step"]) for row in rows if row["run"] == run}):
             some = [row for row in rows if row["run"] == run and int(row["step"]) == step]
             share = np.array([float(row["collected"]) for row in some])
-            mean = {key: np.mean([float(row[key]) for row in some]) for key in ("attempts", "interventions", "seconds")}
+            counts = ("attempts", "interventions", "robot_minutes", "seconds")
+            mean = {key: np.mean([float(row[key]) for row in some]) for key in counts}
             print(
                 f"{run:22}{step:7}{len(some):7}{share.mean():11.1%}{share.min():8.1%}{mean['attempts']:8.0f}"
-                f"{mean['interventions']:15.1f}{mean['seconds']:7.0f}"
+                f"{mean['interventions']:15.1f}{mean['robot_minutes']:11.0f}{mean['seconds']:7.0f}"
             )
 
 
@@ -148,17 +152,18 @@ def plot(rows: list[dict[str, str]], path: Path) -> None:
         axes = panels[0 if "room=no_obstacles" in RUNS[run] else 1]
         mine = [row for row in rows if row["run"] == run]
         seeds = sorted({row["seed"] for row in mine})
-        curves = [[(int(r["step"]), 100 * float(r["collected"])) for r in mine if r["seed"] == s] for s in seeds]
-        steps = sorted({step for curve in curves for step, _ in curve})
-        means = [np.mean([share for curve in curves for step, share in curve if step == at]) for at in steps]
-        (line,) = axes.plot(steps, means, marker="o", label=f"{run}, {len(seeds)} seed{'s' * (len(seeds) > 1)}")
+        curves = np.array(
+            [[(float(r["robot_minutes"]), 100 * float(r["collected"])) for r in mine if r["seed"] == s] for s in seeds]
+        )
+        means = curves.mean(axis=0).T
+        (line,) = axes.plot(*means, marker="o", label=f"{run}, {len(seeds)} seed{'s' * (len(seeds) > 1)}")
         for curve in curves:
-            axes.plot(*zip(*curve, strict=True), color=line.get_color(), alpha=0.25, linewidth=1)
+            axes.plot(*curve.T, color=line.get_color(), alpha=0.25, linewidth=1, marker=".")
     panels[0].axhline(90, color="grey", linestyle=":", label="the paper's, after 30,000 steps")
     panels[0].set(title="no_obstacles", ylabel="objects collected, %", ylim=(0, 102))
     panels[1].set(title="the other rooms")
     for axes in panels:
-        axes.set(xlabel="navigation steps")
+        axes.set(xlabel="minutes of the robot's time", xscale="log")
         axes.legend(loc="center right", fontsize=8)
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

@@ -42,11 +42,7 @@ TRAIN = (
 ROOMS = {
     # Few objects, so that the recorder drives far, as it has to when a room is nearly clean.
     "no_obstacles": ("--robot.num_objects=5 --dataset.num_episodes=100", "--steps=2000"),
-    # Rugs, shadows and furniture take longer to tell from things than an even floor does.
-    "obstacles_rugs": (
-        "--dataset.num_episodes=70",
-        "--steps=3000 --policy.offline_grasp_updates=2000 --policy.background_weight=1",
-    ),
+    "obstacles_rugs": ("--dataset.num_episodes=70", "--steps=2000"),
 }
 COLUMNS = ("room", "policy", "training_seed", "updates", *EpisodeScore.__dataclass_fields__)
 

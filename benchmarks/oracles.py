@@ -1,7 +1,7 @@
 """Which part of a learned policy holds it back: each in turn is replaced by one that knows where the objects are.
 
     python benchmarks/oracles.py --room obstacles \\
-        --policies outputs/learning_curves/fast_obstacles/seed_*/checkpoints/last/pretrained_model
+        --policies outputs/learning_curves/obstacles/seed_*/checkpoints/last/pretrained_model
 
 Seeds 50000 and up are for tuning, and so for finding out. How much of what then remains is physics, the privileged
 controller of sim_difficulty.py says.
@@ -11,83 +11,78 @@ from __future__ import annotations
 
 import argparse
 import csv
-import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 from baselines import rates
 from lerobot.configs.policies import PreTrainedConfig
-from privileged_controller import graspable
-from torch import Tensor, nn
-from torch.nn import functional
+from numpy.typing import NDArray
+from privileged_controller import Controller, graspable
 
 import relmm.plugin  # noqa: F401
 from relmm.commands.evaluate import EpisodeScore, run_episode
 from relmm.commands.policies import make_actor
-from relmm.features import DRIVE_PULSE_S, GRASP_X, GRID, MAX_THETA_VEL, MAX_X_VEL, xy_to_cell
-from relmm.policies.relmm.encoders import NOTICED, FloorObserver, map_places
-from relmm.policies.relmm.grasping import Estimate, GraspEnsemble
+from relmm.features import xy_to_cell
+from relmm.policies.controller import Row
+from relmm.policies.relmm.memory import PLACES, FloorMemory
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 from relmm.sim.env import RelmmRoomEnv
 
-RADIUS = 0.055  # m, of an object on the true map
-STRAIGHT = 35.0  # deg: to what lies further to the side it turns first
-
-
-class TrueMap(nn.Module):
-    """The policy's observation with the objects where they are, also behind obstacles."""
-
-    def __init__(self, observer: FloorObserver, env: RelmmRoomEnv) -> None:
-        super().__init__()
-        self._observer, self._env, self._places = observer, env, map_places()
-        self._known = functional.adaptive_max_pool2d(observer.known.float()[None], observer.shape[1:])[0] > 0
-
-    def forward(self, images: Tensor, grasping: GraspEnsemble) -> Tensor:
-        """As `FloorObserver.forward`, for the one picture of now."""
-        observation = self._observer(images, grasping)
-        truth = self._env.robot.body.truth
-        gone, objects = set(truth.in_basket().tolist()), truth.objects_in_robot_frame()[:, :2]
-        left = torch.tensor([xy for number, xy in enumerate(objects.tolist()) if number not in gone]).reshape(-1, 2)
-        gaps = (self._places[None] - left[:, :, None, None]).norm(dim=1)
-        observation[0, 0] = 255 * (self._known & (gaps < RADIUS).any(dim=0))
-        return observation
-
-
-def know_map(policy: ReLMMPolicy, env: RelmmRoomEnv) -> None:
-    """Navigation sees where things are."""
-    assert isinstance(policy.observer, FloorObserver)
-    policy.observer = TrueMap(policy.observer, env)  # type: ignore[assignment]
+RADIUS = 0.05  # m, of an object on the true map
 
 
 def know_grasps(policy: ReLMMPolicy, env: RelmmRoomEnv) -> None:
     """The gate, and where to grasp: it grasps what is in reach, and nothing else."""
 
-    def look(pictures: Tensor) -> Estimate:
-        mean = torch.zeros(len(pictures), GRID * GRID)
-        body = env.robot.body
+    def look(row: Row) -> None:
+        mind, body = policy.mind(row), env.robot.body
+        mind.mean, mind.std = torch.zeros_like(mind.mean), torch.zeros_like(mind.std)
         for number in graspable(body):
-            mean[0, xy_to_cell(*body.truth.objects_in_robot_frame()[number, :2])] = 1
-        return Estimate(mean, torch.zeros_like(mean))
+            mind.mean[0, xy_to_cell(*body.truth.objects_in_robot_frame()[number, :2])] = 1
 
-    policy.look = look  # type: ignore[method-assign]
+    _after_each_look(policy, look)
 
 
-def drive_by_hand(policy: ReLMMPolicy, env: RelmmRoomEnv) -> None:
-    """It turns to what is nearest on the map, and goes there; where the map is empty, it turns as the policy would."""
-    places, reach = map_places().flatten(1), sum(GRASP_X) / 2
+def know_map(policy: ReLMMPolicy, env: RelmmRoomEnv) -> None:
+    """The remembered floor promises success where things are, also behind obstacles, and nowhere else."""
 
-    def act(observations: Tensor, sides: Tensor, rng: torch.Generator | None) -> Tensor:
-        seen = places[:, observations[0, 0].flatten() >= NOTICED]
-        if seen.shape[1] == 0:
-            return torch.tensor([[0.0, float(sides[0])]])
-        x, y = seen[:, (seen - torch.tensor([[reach], [0.0]])).norm(dim=0).argmin()].tolist()
-        bearing = math.degrees(math.atan2(y, x))
-        speed = max(math.hypot(x, y) - reach, 0.0) / DRIVE_PULSE_S if abs(bearing) < STRAIGHT else 0.0
-        action = [2 * min(speed / MAX_X_VEL, 1) - 1, bearing / DRIVE_PULSE_S / MAX_THETA_VEL]
-        return torch.tensor([action]).clamp(-1, 1)
+    def look(row: Row) -> None:
+        floor = policy.mind(row).floor
+        floor.success = lambda std_weight: _true_success(floor, env)  # type: ignore[method-assign]
 
-    policy.navigation.act = act  # type: ignore[method-assign]
+    _after_each_look(policy, look)
+
+
+def _true_success(floor: FloorMemory, env: RelmmRoomEnv) -> NDArray[np.float32]:
+    truth = env.robot.body.truth
+    left = np.delete(truth.objects_in_robot_frame()[:, :2], truth.in_basket(), axis=0)
+    gaps = np.full(PLACES.shape[:2], np.inf)
+    for place in floor.to_map(left):
+        gaps = np.minimum(gaps, np.linalg.norm(PLACES - place, axis=-1))
+    discs = np.where(gaps < RADIUS, 1 - 0.2 * gaps / RADIUS, 0)  # a little less at the edge: one peak each
+    return np.where(floor.left_alone, 0, discs).astype(np.float32)
+
+
+def drive_by_truth(policy: ReLMMPolicy, env: RelmmRoomEnv) -> None:
+    """The privileged controller drives."""
+
+    def navigate(row: Row) -> dict[str, float]:
+        controller: Controller = row.memory.setdefault("controller", Controller(env.robot.body))
+        return controller.drive()
+
+    policy.navigate = navigate  # type: ignore[method-assign]
+
+
+def _after_each_look(policy: ReLMMPolicy, look: Callable[[Row], None]) -> None:
+    observe = policy.observe
+
+    def knowing(image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> None:
+        observe(image, state, row)
+        look(row)
+
+    policy.observe = knowing  # type: ignore[method-assign]
 
 
 Part = Callable[[ReLMMPolicy, RelmmRoomEnv], None]
@@ -95,9 +90,9 @@ SWAPS: dict[str, tuple[Part, ...]] = {
     "nothing": (),
     "gate": (know_grasps,),
     "map": (know_map,),
-    "driving": (drive_by_hand,),
+    "driving": (drive_by_truth,),
     "gate, map": (know_grasps, know_map),
-    "gate, map, driving": (know_grasps, know_map, drive_by_hand),
+    "gate, driving": (know_grasps, drive_by_truth),
 }
 
 
@@ -116,7 +111,7 @@ def evaluate(folder: Path, room: str, swap: str, seeds: range) -> list[EpisodeSc
 def main() -> None:
     """Print a table and replace the room's rows in a CSV with a row an episode."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--policies", type=Path, nargs="+", required=True, help="folders of `fast` policies")
+    parser.add_argument("--policies", type=Path, nargs="+", required=True, help="folders of `relmm` policies")
     parser.add_argument("--room", required=True)
     parser.add_argument("--swaps", nargs="+", choices=list(SWAPS), default=list(SWAPS), help="of the parts")
     parser.add_argument("--episodes", type=int, default=5, help="of each policy")

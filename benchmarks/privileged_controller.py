@@ -142,6 +142,10 @@ class Controller:
         in_reach = [i for i in graspable(self._body) if self._failures[i] < PATIENCE]
         if in_reach and self._attempts < PICK_UPS_PER_STEP:
             return self._grasp(min(in_reach, key=lambda i: self._failures[i]))
+        return self.drive()
+
+    def drive(self) -> dict[str, float]:
+        """The next navigation step."""
         self._attempts = 0
         self._steps += 1
         if self._steps % MAX_STEPS == 0:

@@ -1,6 +1,9 @@
-"""What one update and one decision of each preset cost, on one core.
+"""What decisions and updates cost on one core, by part, without physics.
 
-python benchmarks/update_speed.py --presets fast paper_small
+    python benchmarks/update_speed.py --policies relmm paper_small
+
+`ensemble`, `memory` and `planning` are the parts of a decision to drive on; `navigation step` and `attempt` are what a
+training step of either kind takes: look, decide, store, learn.
 """
 
 from __future__ import annotations
@@ -17,78 +20,115 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from grasp_learning import POLICIES, make_policy
+from numpy.typing import NDArray
 
-import relmm.plugin  # noqa: F401
-from relmm.commands.presets import PRESETS, load_preset
-from relmm.features import Phase, Skill, cell_to_xy
-from relmm.learning.learner import Learner
-from relmm.learning.replay import Replay
+from relmm.features import ACTION_NAMES, FRONT, Phase
+from relmm.learning.actor import state_vector
+from relmm.policies.controller import Row
+from relmm.policies.learning import Learner, LearningPolicy
+from relmm.policies.pseudo_reset import drive_anywhere
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
-from relmm.policies.relmm.searching import Search
+from relmm.sim.config_locobot_sim import LocobotSimConfig
+from relmm.sim.locobot_sim import LocobotSim
 
 OUTPUT = Path(__file__).parent / "results" / "update_speed.csv"
-FRAMES = 600
+ROOM = "diverse"
+WARM_UP = 300  # steps of either kind before the clock runs; the paper's policy learns from so many on
+
+Senses = tuple[NDArray[np.uint8], NDArray[np.float32]]
+Decide = Callable[[Row], dict[str, float]]
 
 
-def filled_replay(rng: np.random.Generator) -> Replay:
-    """Random pictures, every third frame an attempt."""
-    replay = Replay(1000)
-    for number in range(FRAMES):
-        skill = Skill.GRASP if number % 3 == 2 else Skill.NAVIGATE
-        x, y = cell_to_xy(int(rng.integers(225)))
-        picture = rng.integers(0, 256, (100, 100, 3), np.uint8)
-        replay.add(picture, (0.1, 10.0), [0.2, 10.0, skill, x, y], bool(rng.random() < 0.3), Phase.LEARNING)
-    return replay
+def drive_about(count: int) -> list[Senses]:
+    """What a robot sees on a random drive."""
+    robot, rng = LocobotSim(LocobotSimConfig(room=ROOM, seed=0)), np.random.default_rng(0)
+    robot.connect()
+    seen = []
+    for _ in range(count):
+        robot.send_action(drive_anywhere(rng))
+        observation = robot.get_observation()
+        seen.append((observation[FRONT], state_vector(observation)))
+    robot.disconnect()
+    return seen
 
 
-def milliseconds(action: Callable[[], object], repeats: int) -> float:
-    """Median time of a call."""
-    action()
-    times = []
-    for _ in range(repeats):
+class Drive:
+    """A policy that learns as it goes along a recorded drive; all times in ms."""
+
+    def __init__(self, policy: LearningPolicy, learner: Learner) -> None:
+        self.policy, self.learner, self.row = policy, learner, Row(np.random.default_rng(0))
+        self.times: dict[str, list[float]] = {}
+
+    def fill(self, image: NDArray[np.uint8], state: NDArray[np.float32]) -> None:
+        """Something to learn from."""
+        self.policy.observe(image, state, self.row)
+        self._act(self.policy.attempt, image, state)
+        self._act(self.policy.navigate, image, state)
+
+    def go(self, seen: list[Senses]) -> None:
+        """Both kinds of training steps at each place."""
+        for image, state in seen:
+            looking = self._time("observe", self.policy.observe, image, state, self.row)
+            if isinstance(self.policy, ReLMMPolicy):
+                ensemble = self.policy.grasping
+                self._time("ensemble", ensemble.look, ensemble.to_pictures(image))
+            deciding = self._time("attempt decision", self._act, self.policy.attempt, image, state)
+            learning = self._time("attempt update", self.learner.update_grasping, Phase.LEARNING)
+            self.times.setdefault("attempt", []).append(looking + deciding + learning)
+            deciding = self._time("navigate decision", self._act, self.policy.navigate, image, state)
+            learning = self._time("navigate update", self.learner.update_navigation)
+            self.times.setdefault("navigate", []).append(looking + deciding + learning)
+
+    def _act(self, act: Decide, image: NDArray[np.uint8], state: NDArray[np.float32]) -> None:
+        action = act(self.row)
+        values = np.array([action[name] for name in ACTION_NAMES], np.float32)
+        self.learner.add(image, state, values, bool(self.row.rng.random() < 0.3), Phase.LEARNING)
+
+    def _time(self, name: str, action: Callable[..., object], *arguments: object) -> float:
         start = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - start)
-    return 1000 * float(np.median(times))
+        action(*arguments)
+        self.times.setdefault(name, []).append(1000 * (time.perf_counter() - start))
+        return self.times[name][-1]
+
+    def median(self, name: str) -> float:
+        """Of what took place so far."""
+        return float(np.median(self.times[name])) if name in self.times else float("nan")
 
 
-def measure(preset: str, repeats: int) -> dict[str, object]:
+def measure(name: str, seen: list[Senses]) -> dict[str, object]:
     """A row of the table."""
-    config = load_preset(preset)
-    config.device = "cpu"
-    config.grasp_updates = config.navigation_updates = 1
-    config.min_attempts_to_update = config.min_steps_to_update = 1
-    rng = np.random.default_rng(0)
-    policy, replay = ReLMMPolicy(config), filled_replay(rng)
-    learner = Learner(policy, replay, seed=0)
-    pictures = policy.to_pictures(replay.pictures(np.array([0]))[0])
-    learner.update_navigation()  # fills the maps
-
-    def update_navigation() -> None:
-        learner.maps.version += 1  # as after an attempt: all maps are outdated
-        learner.update_navigation()
-
+    policy = make_policy(name, min_attempts_to_update=1)
+    policy.sampling = True
+    drive = Drive(policy, policy.make_learner(seed=0, capacity=10_000))
+    for number in range(WARM_UP):
+        drive.fill(*seen[number % len(seen)])
+    drive.go(seen)
+    ensemble, looking, planning = drive.median("ensemble"), drive.median("observe"), drive.median("navigate decision")
     row = {
-        "navigation_update_ms": milliseconds(update_navigation, repeats),
-        "grasp_update_ms": milliseconds(lambda: learner.update_grasping(Phase.LEARNING), repeats),
-        "decision_ms": milliseconds(
-            lambda: (policy.look(pictures), policy.navigate(pictures, 0.0, Search(), None)), repeats
-        ),
+        "ensemble_ms": ensemble if np.isfinite(ensemble) else looking,
+        "memory_ms": looking - ensemble if np.isfinite(ensemble) else 0.0,
+        "planning_ms": planning,
+        "decision_ms": looking + planning,
+        "grasp_updates_ms": drive.median("attempt update"),
+        "navigation_updates_ms": drive.median("navigate update"),
+        "navigation_step_ms": drive.median("navigate"),
+        "attempt_ms": drive.median("attempt"),
     }
-    batches = {"navigation_batch": config.navigation_batch_size, "grasp_batch": config.grasp_batch_size}
     parameters = sum(weight.numel() for weight in policy.parameters() if weight.requires_grad)
-    return {"preset": preset, **batches, **{k: round(v, 1) for k, v in row.items()}, "parameters": parameters}
+    return {"policy": name, **{key: round(value, 1) for key, value in row.items()}, "parameters": parameters}
 
 
 def main() -> None:
     """Measure, print and save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--presets", nargs="*", default=["fast", "paper_small"], choices=PRESETS)
-    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--policies", nargs="*", default=["relmm", "paper_small"], choices=POLICIES)
+    parser.add_argument("--places", type=int, default=60, help="to measure at")
     parser.add_argument("--output", type=Path, default=OUTPUT)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [measure(preset, arguments.repeats) for preset in arguments.presets]
+    seen = drive_about(arguments.places)
+    rows = [measure(name, seen) for name in arguments.policies]
     for row in rows:
         print(", ".join(f"{key} {value}" for key, value in row.items()))
     arguments.output.parent.mkdir(parents=True, exist_ok=True)

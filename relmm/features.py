@@ -50,9 +50,18 @@ BASKET_XY = (0.025, -0.1075)  # m, robot frame
 
 # --- Observations --------------------------------------------------------------------------------------------
 JOINT_NAMES = ("waist.pos", "shoulder.pos", "elbow.pos", "wrist_angle.pos", "wrist_rotate.pos")  # degrees
-# Velocities in m/s and deg/s; the gripper's opening in metres; holding 0 or 1; bumper: the sum of 1 (right),
-# 2 (centre) and 4 (left), as the Kobuki reports it.
-STATE_NAMES = ("x.vel", "theta.vel", *JOINT_NAMES, "gripper.pos", "holding.pos", "bumper.pos")
+# How far the wheels moved the base during the last skill, in its frame at the beginning, divided by `DRIVE_PULSE_S`;
+# turns away from obstacles are part of it. m/s forward, m/s left, deg/s (positive = left).
+MOTION_NAMES = ("x.vel", "y.vel", "theta.vel")
+# The nearest thing higher than the objects in each direction, m from the robot's centre; right to left.
+SCAN_BEARINGS = tuple(range(-60, 61, 3))  # degrees, positive = left; each is the middle of a sector of 3 degrees
+SCAN_NAMES = tuple(f"scan_{index:02d}.pos" for index in range(len(SCAN_BEARINGS)))
+SCAN_RANGE = 3.0  # m; the value of a sector in which no such thing is seen
+# The gripper's opening in metres; holding 0 or 1; bumper: the sum of 1 (right), 2 (centre) and 4 (left), as the Kobuki
+# reports it.
+STATE_NAMES = (*MOTION_NAMES, *JOINT_NAMES, "gripper.pos", "holding.pos", "bumper.pos", *SCAN_NAMES)
+MOTION = slice(0, len(MOTION_NAMES))  # where these stand in `observation.state`
+SCAN = slice(len(STATE_NAMES) - len(SCAN_NAMES), len(STATE_NAMES))
 
 FRONT = "front"
 FRONT_DEPTH = "front_depth"
@@ -102,6 +111,13 @@ def action_dict(
 
 
 # --- Datasets ------------------------------------------------------------------------------------------------
+# What a policy believed when it decided (`complementary_info.<name>`), -1 where it has no opinion: P[grasp], and mean
+# and standard deviation over the ensemble at the attempted cell.
+BELIEF = ("grasp_probability", "grasp_mean", "grasp_std")
+# Where the robot was at the frame's start, by its own wheels since the run began: m, m, degrees (not wrapped).
+ODOMETRY = ("odom_x", "odom_y", "odom_heading")
+
+
 def outcome_features() -> dict[str, dict[str, Any]]:
     """The columns a recorded frame has beyond LeRobot's observation and action."""
     scalar = {"shape": (1,), "names": None}
@@ -111,7 +127,7 @@ def outcome_features() -> dict[str, dict[str, Any]]:
         "next.truncated": {"dtype": "bool", **scalar},  # the episode ended at its step limit
         "next.success": {"dtype": "bool", **scalar},
         "complementary_info.phase": {"dtype": "int64", **scalar},  # a `Phase`
-        "complementary_info.grasp_probability": {"dtype": "float32", **scalar},  # P[grasp], -1 where not asked
+        **{f"complementary_info.{name}": {"dtype": "float32", **scalar} for name in (*BELIEF, *ODOMETRY)},
         "complementary_info.robot_time": {"dtype": "float32", **scalar},  # s on the robot's clock, at the frame's start
     }
 
@@ -121,9 +137,12 @@ DATASET_COLUMNS = {
     "action": "what was really done: `x.vel` m/s forward, `theta.vel` deg/s (positive = left), both during the drive "
     "pulse of a navigation step; `skill.pos` 0 navigate, 1 grasp, 2 place; `skill_x.pos`, `skill_y.pos` m in the "
     "robot's frame (x forward, y left): where to grasp or place",
-    STATE_KEY: "`x.vel` m/s and `theta.vel` deg/s of the last navigation step, from the wheel encoders; arm joints in "
+    STATE_KEY: "`x.vel`, `y.vel` m/s and `theta.vel` deg/s: how far the wheels moved the base forward, left and round "
+    f"(positive = left) during the last skill, seen from where it began, divided by {DRIVE_PULSE_S} s; arm joints in "
     "degrees; `gripper.pos` m between the finger pads; `holding.pos` 0 or 1; `bumper.pos` the sum of 1 right, "
-    "2 centre, 4 left",
+    "2 centre, 4 left; `scan_*.pos` m from the robot's centre to the nearest thing higher than the objects, every "
+    f"{SCAN_BEARINGS[1] - SCAN_BEARINGS[0]} degrees from {SCAN_BEARINGS[0]} to {SCAN_BEARINGS[-1]} (positive = left), "
+    f"{SCAN_RANGE} where none is seen",
     IMAGE_KEY: "the robot's camera before the skill, RGB, PNG, lossless",
     DEPTH_KEY: "millimetres along the optical axis",
     "next.reward": "1.0 where this frame's grasp picked something up, as the robot's own sensors judge it",
@@ -131,29 +150,43 @@ DATASET_COLUMNS = {
     "next.truncated": "the episode ended at its step limit, or because the recording was stopped",
     "next.success": "as `next.done`",
     "complementary_info.phase": "who acted, see above",
-    "complementary_info.grasp_probability": "P[grasp] where the policy estimates it, else -1",
+    "complementary_info.grasp_probability": "P[grasp] before the action where the policy estimates it, else -1",
+    "complementary_info.grasp_mean": "the ensemble's mean success at the attempted cell before the attempt, else -1",
+    "complementary_info.grasp_std": "its standard deviation over the members, else -1",
+    "complementary_info.odom_x": "m, where the robot was when the frame began, by its wheels since the run began",
+    "complementary_info.odom_y": "m, likewise",
+    "complementary_info.odom_heading": "degrees, likewise, not wrapped, positive = left",
     "complementary_info.robot_time": "s on the robot's clock when the frame began",
     "timestamp": f"s, the frame's number in its episode divided by {FPS}",
 }
 
 
-def dataset_features(depth: bool = False) -> dict[str, dict[str, Any]]:
+def dataset_features(depth: bool = False, camera: dict[str, Any] | None = None) -> dict[str, dict[str, Any]]:
     """The whole schema of a relmm dataset, as `LeRobotDataset.create(features=...)` takes it.
 
     Args:
         depth: also store the depth picture (millimetres).
+        camera: what is known about the camera that takes the pictures, see `relmm.geometry.camera_info`. It becomes
+            part of the pictures' `info`, which LeRobot's own tools keep when they edit a dataset, and compare when they
+            merge several.
     """
     size, names = IMAGE_SIZE, ["height", "width", "channels"]
+    known = {} if camera is None else {"camera": camera}
     features: dict[str, dict[str, Any]] = {
         "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)},
         STATE_KEY: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
-        IMAGE_KEY: {"dtype": "image", "shape": (size, size, 3), "names": names, "info": {"is_depth_map": False}},
+        IMAGE_KEY: {
+            "dtype": "image",
+            "shape": (size, size, 3),
+            "names": names,
+            "info": {"is_depth_map": False, **known},
+        },
     }
     if depth:
         features[DEPTH_KEY] = {
             "dtype": "image",
             "shape": (size, size, 1),
             "names": names,
-            "info": {"is_depth_map": True},
+            "info": {"is_depth_map": True, **known},
         }
     return features | outcome_features()

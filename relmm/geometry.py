@@ -7,11 +7,25 @@ Dimensions: Interbotix `mobile_wx200.urdf.xacro` on a Kobuki.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from relmm.errors import ConfigError, RobotError
 from relmm.features import IMAGE_SIZE, FloatArray
+
+
+def moved(pose: FloatArray, motion: FloatArray) -> FloatArray:
+    """Where a motion leads that is given in the robot's own frame.
+
+    Args:
+        pose: x, y (m) and heading (rad), shape (3,).
+        motion: forward, left (m) and turn (rad), shape (3,).
+    """
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    forward, left, turn = motion
+    return pose + np.array([cos * forward - sin * left, sin * forward + cos * left, turn])
+
 
 # --- Arm (WidowX-200) ----------------------------------------------------------------------------------------
 ARM_BASE = np.array([0.097277, 0.0, 0.10795])  # m, robot frame
@@ -163,3 +177,13 @@ def camera_geometry(name: str) -> CameraGeometry:
     if name not in CAMERAS:
         raise ConfigError(f"Unknown camera {name!r}: choose one of {', '.join(CAMERAS)}.")
     return CAMERAS[name]
+
+
+def camera_info(name: str) -> dict[str, Any]:
+    """What a dataset says about the camera that took its pictures, plain JSON values.
+
+    Raises:
+        ConfigError: there is no such camera.
+    """
+    camera = camera_geometry(name)
+    return {"name": name, "position": list(camera.position), "pitch": camera.pitch, "fov": list(camera.fov)}

@@ -5,12 +5,20 @@ import pytest
 
 from relmm.features import (
     ACTION_NAMES,
+    DATASET_COLUMNS,
+    DEPTH_KEY,
     DRIVE_PULSE_S,
     GRASP_X,
     GRASP_Y,
     GRID,
+    IMAGE_KEY,
     MAX_THETA_VEL,
     MAX_X_VEL,
+    MOTION,
+    MOTION_NAMES,
+    SCAN,
+    SCAN_BEARINGS,
+    SCAN_NAMES,
     STATE_NAMES,
     Skill,
     action_dict,
@@ -81,3 +89,26 @@ def test_dataset_features_have_a_name_for_each_value(depth: bool) -> None:
     assert all(
         len(f["names"]) == f["shape"][0] for key, f in features.items() if key in ("action", "observation.state")
     )
+
+
+def test_every_column_has_a_meaning() -> None:
+    assert set(dataset_features(depth=True)) <= set(DATASET_COLUMNS)
+
+
+def test_slices_of_the_state_are_where_their_names_are() -> None:
+    assert STATE_NAMES[MOTION] == MOTION_NAMES
+    assert STATE_NAMES[SCAN] == SCAN_NAMES
+    assert len(set(STATE_NAMES)) == len(STATE_NAMES)
+
+
+def test_a_scan_looks_as_far_to_the_left_as_to_the_right() -> None:
+    assert len(SCAN_NAMES) == len(SCAN_BEARINGS)
+    assert tuple(-bearing for bearing in reversed(SCAN_BEARINGS)) == SCAN_BEARINGS
+    assert SCAN_BEARINGS[len(SCAN_BEARINGS) // 2] == 0
+
+
+def test_each_picture_keeps_what_is_known_about_its_camera() -> None:
+    known, unknown = dataset_features(True, {"name": "mine"}), dataset_features(True)
+    for key, depth in ((IMAGE_KEY, False), (DEPTH_KEY, True)):
+        assert unknown[key]["info"] == {"is_depth_map": depth}
+        assert known[key]["info"] == {"is_depth_map": depth, "camera": {"name": "mine"}}

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from itertools import pairwise
 
 import mujoco
@@ -18,6 +19,8 @@ from relmm.geometry import (
     arm_forward,
     arm_inverse,
     camera_geometry,
+    camera_info,
+    moved,
 )
 from relmm.sim.model import ROBOT, build_model
 from relmm.sim.rooms import make_room
@@ -154,3 +157,33 @@ def test_behind_the_camera_there_are_no_pixels() -> None:
 def test_unknown_camera_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=r"Unknown camera 'fisheye': choose one of paper, d435\."):
         camera_geometry("fisheye")
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_what_a_dataset_says_about_a_camera_is_the_camera(name: str) -> None:
+    info = json.loads(json.dumps(camera_info(name)))
+    assert info == camera_info(name)
+    assert info.pop("name") == name
+    position, fov = tuple(info.pop("position")), tuple(info.pop("fov"))
+    assert CameraGeometry(position=position, fov=fov, **info) == CAMERAS[name]
+
+
+# --- Odometry ------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("pose", "motion", "expected"),
+    [
+        ((0, 0, 0), (0.3, 0.1, 0.2), (0.3, 0.1, 0.2)),
+        ((1, 2, np.pi / 2), (0.3, 0.1, 0.2), (0.9, 2.3, np.pi / 2 + 0.2)),
+        ((1, 2, np.pi), (0.3, 0.1, -0.2), (0.7, 1.9, np.pi - 0.2)),
+        ((1, 2, -6 * np.pi), (0.3, 0.1, -1), (1.3, 2.1, -6 * np.pi - 1)),  # a heading is not wrapped
+    ],
+)
+def test_a_motion_is_seen_from_where_it_begins(pose, motion, expected) -> None:
+    assert moved(np.array(pose, float), np.array(motion, float)) == pytest.approx(expected)
+
+
+def test_motions_compose_in_any_grouping() -> None:
+    a, b, c = np.random.default_rng(0).uniform(-2, 2, (3, 3))
+    np.testing.assert_allclose(moved(moved(a, b), c), moved(a, moved(b, c)))
+    back = np.array([-(np.cos(a[2]) * a[0] + np.sin(a[2]) * a[1]), np.sin(a[2]) * a[0] - np.cos(a[2]) * a[1], -a[2]])
+    np.testing.assert_allclose(moved(a, back), 0, atol=1e-12)

@@ -16,7 +16,6 @@ from lerobot.envs.configs import EnvConfig
 
 from relmm.commands.cli import dated_folder, progress, run
 from relmm.commands.policies import make_actor, policy_from_path, take_seed
-from relmm.commands.thoughts import describe_action, grasp_map
 from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES
 from relmm.learning.actor import Actor
@@ -151,7 +150,7 @@ def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: P
         while not ended:
             action = actor.act(_robot_observation(observation))
             if film is not None:
-                film.caption, film.inset = _caption(info, describe_action(action)), grasp_map(actor, action)
+                film.caption, film.inset = _caption(info, actor.describe(action)), actor.picture()
             observation, _, terminated, truncated, info = env.step(np.array([action[n] for n in ACTION_NAMES]))
             ended = terminated or truncated
             bar.set_postfix(collected=info["objects_collected"], grasps=info["grasp_attempts"], refresh=False)
@@ -172,12 +171,10 @@ def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: P
 
 
 def _caption(info: dict[str, Any], doing: str) -> str:
-    lines = (
-        f"{info['objects_collected']} of {info['objects_total']} collected",
-        f"step {info['navigation_steps']}, {info['grasp_attempts']} grasps",
-        doing,
+    return (
+        f"{info['objects_collected']} of {info['objects_total']} collected, step {info['navigation_steps']}, "
+        f"{info['grasp_attempts']} grasps\n{doing}"
     )
-    return "\n".join(lines)
 
 
 def _robot_observation(observation: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,16 @@ from huggingface_hub import ModelCard, ModelCardData
 
 from relmm.episodes import UploadedDataset
 from relmm.episodes.card import CITATION, table
-from relmm.features import GRASP_X, GRASP_Y, IMAGE_SIZE, MAX_THETA_VEL, MAX_X_VEL
+from relmm.features import (
+    GRASP_X,
+    GRASP_Y,
+    IMAGE_SIZE,
+    MAX_THETA_VEL,
+    MAX_X_VEL,
+    NAVIGATION_STEP_S,
+    SCAN_NAMES,
+    STATE_NAMES,
+)
 from relmm.geometry import camera_geometry
 from relmm.learning.hub import CURVE
 from relmm.learning.progress import read_metrics
@@ -66,13 +75,20 @@ def model_card(facts: ModelFacts) -> ModelCard:
     return ModelCard("\n\n".join(sections) + "\n", ignore_metadata_errors=False)
 
 
+_NAVIGATION = {
+    "relmm": "ways to where it would are planned over the floor that it remembers",
+    "relmm_paper": "soft actor-critic navigates to where it would",
+}
+
+
 def _head(facts: ModelFacts) -> str:
+    kind = facts.settings["policy"]["type"]
     return f"""# {facts.repo_id}
 
-A policy that drives a LoCoBot about a room and picks things up, learned online from scratch with `relmm`, a
+A policy `{kind}` that drives a LoCoBot about a room and picks things up, learned online from scratch with `relmm`, a
 [LeRobot](https://github.com/huggingface/lerobot) package of ReLMM: an ensemble of networks says where a grasp would
-succeed, a gate decides whether to try, and soft actor-critic navigates to where it would. Rewards come from the robot's
-own sensors; no demonstrations, no reset, no map."""
+succeed, a gate decides whether to try, and {_NAVIGATION[kind]}. Rewards come from the
+robot's own sensors; no demonstrations, no reset, no map is given."""
 
 
 def _room(settings: dict[str, Any]) -> str:
@@ -102,7 +118,8 @@ def _interface() -> str:
         (
             "in",
             "`observation.state`",
-            "10 numbers: base velocities (m/s, deg/s), arm joints (deg), gripper (m), holding, bumper",
+            f"{len(STATE_NAMES)} numbers: base motion (m/s, deg/s), arm joints (deg), gripper (m), holding, bumper, "
+            f"distances to what stands in {len(SCAN_NAMES)} directions (m)",
         ),
         ("out", "`x.vel`, `theta.vel`", f"0 to {MAX_X_VEL} m/s forward, up to {MAX_THETA_VEL} deg/s (positive = left)"),
         ("out", "`skill.pos`", "0 navigate, 1 grasp, 2 place"),
@@ -112,7 +129,10 @@ def _interface() -> str:
             f"where to grasp or place, m in the robot's frame: {x} forward, {y} left",
         ),
     ]
-    return table(("", "name", "what"), rows) + "\n\nOne action is one blocking skill; a navigation step takes 0.5 s."
+    return (
+        table(("", "name", "what"), rows) + "\n\nOne action is one blocking skill; a navigation step "
+        f"takes {NAVIGATION_STEP_S} s."
+    )
 
 
 def _results(settings: dict[str, Any], lines: list[dict[str, Any]]) -> str:
@@ -153,7 +173,8 @@ def _training(facts: ModelFacts, lines: list[dict[str, Any]]) -> str:
     return (
         f"{head} So far: {last['steps']} navigation steps, {last['pseudo_reset_steps']} more in pseudo-resets, "
         f"{last['attempts']} grasp attempts of which {last['successes']} succeeded, {last['objects']} objects "
-        f"picked up outside the curriculum; objects that a person put into reach: {last['interventions']}.\n\n"
+        f"picked up outside the curriculum, in {last['robot_minutes']:.0f} minutes of the robot's time; objects that a "
+        f"person put into reach: {last['interventions']}.\n\n"
         f"![Learning curve: objects collected in evaluations, and training]({CURVE})"
     )
 

@@ -7,22 +7,22 @@ from importlib.resources import files
 from pathlib import Path
 
 from relmm.errors import ConfigError
-from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
-PRESETS = ("fast", "paper", "paper_small")
+PRESETS = ("paper", "paper_small")
 _OPTION = "--config_path="
 
 
 def preset_path(name: str) -> Path:
     """The file of a preset."""
-    return Path(str(files("relmm.policies.relmm"))) / "presets" / f"{name}.json"
+    return Path(str(files("relmm.policies.relmm_paper"))) / "presets" / f"{name}.json"
 
 
-def load_preset(name: str) -> ReLMMConfig:
+def load_preset(name: str) -> RelmmPaperConfig:
     """A preset as a policy's config."""
     settings = json.loads(preset_path(name).read_text(encoding="utf-8"))["policy"]
     settings.pop("type")
-    return ReLMMConfig(**settings)
+    return RelmmPaperConfig(**settings)
 
 
 def resolve_config_path(arguments: list[str]) -> None:

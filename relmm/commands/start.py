@@ -14,7 +14,8 @@ relmm-train: a robot is put into a room and learns to clean it.
 
   --robot.room=NAME             no_obstacles, obstacles, diverse, obstacles_rugs
   --robot.num_objects=N         that lie about
-  --config_path=fast            or paper, paper_small, a file
+  --policy.type=relmm           or relmm_paper: the paper's networks and soft actor-critic
+  --config_path=paper           or paper_small: relmm_paper with the paper's numbers, or smaller; or a file
   --policy.path=DIR             or user/repo[@revision]: go on from its weights
   --policy.device=cpu           or cuda, mps
   --curriculum.type=stationary  or autonomous, none
@@ -38,7 +39,7 @@ relmm-eval: how much of a room a policy cleans, with videos.
 
   --policy.path=DIR             or user/repo[@revision]
   --policy.type=relmm_scripted  or relmm_random: policies without weights
-  --policy.sample=true          sampled actions instead of greedy ones (relmm)
+  --policy.sample=true          sampled actions instead of greedy ones (relmm, relmm_paper)
   --env.room=NAME               no_obstacles, obstacles, diverse, obstacles_rugs
   --env.num_objects=N           that lie about
   --env.navigation_steps=250    length of an episode
@@ -61,7 +62,7 @@ relmm-record: record a robot's life as a LeRobot dataset.
   --dataset.num_episodes=N      to record in this run
   --dataset.push_to_hub=true    upload it at the end
   --max_steps=250               navigation steps after which an episode is cut off
-  --pseudo_reset_steps=20       random steps before and after an object is put down again
+  --pseudo_reset_steps=20       steps, at most, before and after an object is put down again
   --seed=0                      of everything random
   --resume=true                 go on with the dataset in its folder
 """,

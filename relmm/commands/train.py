@@ -15,6 +15,7 @@ from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.curve import draw_learning_curve
 from relmm.commands.hub_resume import take_over_from_hub
 from relmm.commands.policies import make_actor
+from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
 from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_uploads, run_arguments
@@ -37,14 +38,11 @@ from relmm.learning.checkpoint import (
     pretrained_model,
     save_checkpoint,
 )
-from relmm.learning.learner import Learner
 from relmm.learning.life import Life
 from relmm.learning.progress import Metrics, Progress
-from relmm.learning.replay import Replay
 from relmm.learning.session import Schedule, Session
 from relmm.learning.trainer import Trainer
-from relmm.policies.relmm.configuration_relmm import ReLMMConfig
-from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.policies.learning import LearningConfig, LearningPolicy
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.locobot_sim import LocobotSim
@@ -63,7 +61,7 @@ class Run:
     """
 
     def __init__(self, config: TrainConfig, signals: StopOnSignal) -> None:
-        assert isinstance(config.policy, ReLMMConfig)
+        assert isinstance(config.policy, LearningConfig)
         self.config, self.signals = config, signals
         self.saved_config = draccus.encode(config)  # as it was given, for a resume
         self.checkpoint = last_checkpoint(config.checkpoints) if config.resume else None
@@ -73,10 +71,10 @@ class Run:
         self.actor = make_actor(config.policy)
         config.policy.pretrained_path = None  # a checkpoint stands for itself, wherever it is copied to
         policy = self.actor.policy
-        assert isinstance(policy, ReLMMPolicy)
+        assert isinstance(policy, LearningPolicy)
         self.policy = policy
-        self.replay = Replay(config.replay_frames)
-        self.learner = Learner(policy, self.replay, config.seed)
+        policy.train()
+        self.learner = policy.make_learner(config.seed, config.replay_frames)
         self.rng = np.random.default_rng([config.seed, _TRAINER_STREAM])
         self.progress = Progress()
         assert config.output_dir is not None
@@ -90,12 +88,12 @@ class Run:
             cursor, self.progress.interventions = counters["episodes"], counters["interventions"]
         if self.config.dataset.init is not None:
             root = local_root(self.config.dataset.init)
-            check_trainable(root)
+            check_trainable(root, self.policy.config.camera)
             self._read(root, "reading the initial dataset", update_from=0 if self.checkpoint is None else None)
         if self.checkpoint is not None:
             root = self.config.dataset.follow or self.config.dataset_root
             if root.exists():
-                check_trainable(root)
+                check_trainable(root, self.policy.config.camera)
                 self._read(root, "reading the run's own dataset", update_from=cursor, count=True)
 
     def _read(self, root: Path, title: str, update_from: int | None, count: bool = False) -> None:
@@ -103,9 +101,8 @@ class Run:
             for episode in read_episodes(root):
                 update = update_from is not None and episode.index >= update_from
                 self.learner.read(episode, update)
-                for action, reward, phase in zip(episode.actions, episode.rewards, episode.phases, strict=True):
-                    if count:
-                        self.progress.add(float(action[2]), bool(reward > 0), int(phase))
+                if count:
+                    self.progress.read(episode)
                 bar.update()
 
     def save(self, episodes: int) -> None:
@@ -114,7 +111,7 @@ class Run:
         Args:
             episodes: of the run's dataset that the weights have learned from; a resumed run learns the later ones.
         """
-        counters = {**self.progress.asdict(), "episodes": episodes}
+        counters = {"episodes": episodes, "interventions": self.progress.interventions}
         save_checkpoint(
             self.config.checkpoints,
             self.progress.steps,
@@ -199,7 +196,7 @@ def _train_on_robot(run: Run) -> None:
                 print(recorder.repaired)
             life = Life(
                 robot,
-                [recorder, run.replay, run.progress],
+                [recorder, run.learner, run.progress],
                 robot.seconds,
                 config.max_steps,
                 should_stop=lambda: run.signals.stopped,
@@ -237,7 +234,7 @@ def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:
         save_unfinished=True,
         depth="front_depth" in robot.observation_features,
         robot_type=robot.name,
-        info={**info, "seed": seed, "started": now(), "policy": "relmm", "curriculum": config.curriculum.type},
+        info={**info, "seed": seed, "started": now(), "policy": run.policy.name, "curriculum": config.curriculum.type},
     )
 
 
@@ -284,15 +281,14 @@ def _train_on_stream(run: Run, root: Path) -> None:
 
 
 def main() -> None:
-    """Entry point of `relmm-train`; there is only one policy that learns, so its type need not be said."""
+    """Entry point of `relmm-train`."""
     run("relmm-train", TrainConfig, train, prepare=_prepare)
 
 
 def _prepare(arguments: list[str]) -> None:
     take_over_from_hub(arguments)
     resolve_config_path(arguments)
-    if not any(argument.startswith(("--policy.type", "--policy.path", "--config_path")) for argument in arguments):
-        arguments.append("--policy.type=relmm")
+    choose_policy(arguments)
 
 
 if __name__ == "__main__":

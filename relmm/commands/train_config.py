@@ -15,6 +15,7 @@ from relmm.commands.upload import LICENSE
 from relmm.episodes import check_repo_id
 from relmm.errors import ConfigError
 from relmm.learning.curriculum import CURRICULA
+from relmm.policies.learning import LearningConfig
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 
@@ -125,8 +126,8 @@ class TrainConfig:
         save_freq: navigation steps between checkpoints.
         log_freq: navigation steps between lines of `metrics.jsonl`.
         max_steps: navigation steps after which an episode is cut off.
-        pseudo_reset_steps: random navigation steps before and after a picked-up object is put down again.
-        replay_frames: frames to learn from that are kept in memory, 30 kB each.
+        pseudo_reset_steps: navigation steps, at most, before and after a picked-up object is put down again.
+        replay_frames: attempts (relmm, 1.6 kB each) or frames (relmm_paper, 30 kB) to learn from, kept in memory.
         num_threads: of torch; 1 is the fastest on few cores.
     """
 
@@ -151,8 +152,11 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         self.policy = policy_from_path(self.policy or ReLMMConfig())
-        if not isinstance(self.policy, ReLMMConfig):
-            raise ConfigError(f"relmm-train trains --policy.type=relmm, not {self.policy.type}.")
+        if not isinstance(self.policy, LearningConfig):
+            raise ConfigError(
+                f"relmm-train trains --policy.type=relmm or relmm_paper, not {self.policy.type}: choose one of these, "
+                "or train that one with lerobot-train."
+            )
         for name, least in _LEAST.items():
             if getattr(self, name) < least:
                 raise ConfigError(f"{name} is {getattr(self, name)}, but must be at least {least}.")

@@ -10,7 +10,7 @@ import numpy as np
 from relmm.commands.evaluate import run_episode
 from relmm.commands.train_config import TrainEvalConfig
 from relmm.learning.actor import Actor
-from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
+from relmm.policies.learning import LearningPolicy
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.env import RelmmRoomEnv
 
@@ -32,7 +32,7 @@ class RoomEvaluation:
     def __call__(self, step: int) -> dict[str, Any]:
         """The scores of the policy as it is now, for the metrics."""
         policy = self._actor.policy
-        assert isinstance(policy, ReLMMPolicy)
+        assert isinstance(policy, LearningPolicy)
         policy.sampling = False
         policy.eval()
         try:

@@ -7,6 +7,7 @@ from typing import Any
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
+from relmm.episodes.settings import describe_camera
 from relmm.episodes.summary import DatasetSummary, summarize
 from relmm.features import ACTION_NAMES, DATASET_COLUMNS, FPS, JOINT_NAMES, MAX_THETA_VEL, MAX_X_VEL, Phase
 
@@ -97,11 +98,17 @@ def _who(summary: DatasetSummary) -> str:
 
 def _columns(features: dict[str, Any]) -> str:
     rows = [
-        (f"`{key}`", f"{feature['dtype']} {tuple(feature['shape'])}", DATASET_COLUMNS.get(key, "LeRobot's own"))
+        (f"`{key}`", f"{feature['dtype']} {tuple(feature['shape'])}", _meaning(key, feature))
         for key, feature in features.items()
     ]
     names = f"`{'`, `'.join(ACTION_NAMES[:2])}` reach {MAX_X_VEL} m/s and {MAX_THETA_VEL} deg/s. Joints in degrees: "
     return table(("column", "type", "meaning and unit"), rows) + f"\n\n{names}`{'`, `'.join(JOINT_NAMES)}`."
+
+
+def _meaning(key: str, feature: dict[str, Any]) -> str:
+    camera = (feature.get("info") or {}).get("camera")
+    seen_by = "" if camera is None else f"; camera {describe_camera(camera)}: m in the robot's frame, degrees"
+    return DATASET_COLUMNS.get(key, "LeRobot's own") + seen_by
 
 
 def _runs(runs: list[dict[str, Any]]) -> str:

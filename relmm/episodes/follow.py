@@ -58,12 +58,13 @@ class Episode:
         return len(self.rewards)
 
 
-def read_episodes(root: Path | str, first: int = 0) -> Iterator[Episode]:
+def read_episodes(root: Path | str, first: int = 0, camera: str | None = None) -> Iterator[Episode]:
     """All episodes that are saved by now, in order, one at a time in memory.
 
     Args:
         root: a dataset; it may be being recorded.
         first: number of the first episode to read.
+        camera: that it must be of, None for any.
 
     Returns:
         An iterator, which raises DatasetError where a listed episode is damaged.
@@ -71,8 +72,8 @@ def read_episodes(root: Path | str, first: int = 0) -> Iterator[Episode]:
     Raises:
         DatasetError: no dataset, or none that relmm can train on; at once, not at the first episode.
     """
-    check_trainable(root)
-    return _read_all(EpisodeFollower(root, first))
+    check_trainable(root, camera)
+    return _read_all(EpisodeFollower(root, first, camera))
 
 
 def _read_all(follower: EpisodeFollower) -> Iterator[Episode]:
@@ -98,12 +99,13 @@ class EpisodeFollower:
             where files were just being replaced, or LeRobot's own recorder has not finished them; else it is damage.
     """
 
-    def __init__(self, root: Path | str, first: int = 0) -> None:
+    def __init__(self, root: Path | str, first: int = 0, camera: str | None = None) -> None:
         """Reads no episode yet.
 
         Args:
             root: the dataset; it need not exist yet.
             first: number of the first episode to read.
+            camera: that it must be of, None for any.
 
         Raises:
             DatasetError: it exists, and is none that relmm can train on.
@@ -111,6 +113,7 @@ class EpisodeFollower:
         self.next = first
         self.problem = ""
         self._folder = DatasetFolder(root)
+        self._camera = camera
         self._data_path = self._find_data_path()
         self._last_episodes: dict[str, int] = {}  # number of the last one, by file of meta/episodes
 
@@ -142,7 +145,7 @@ class EpisodeFollower:
         info = self._folder.read_json(INFO)
         if info is None:
             return None
-        check_trainable(self._folder.root)
+        check_trainable(self._folder.root, self._camera)
         return str(info["data_path"])
 
     def _new_rows(self) -> Iterator[dict[str, Any]]:

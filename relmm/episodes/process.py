@@ -57,13 +57,13 @@ def write_episodes(commands: Connection, replies: Connection, settings: WriterSe
     """
     for number in IGNORED_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    os.nice(NICENESS)
     saved = 0
     try:
         with settings.start() as dataset:
             saved = dataset.episodes
             repaired = dataset.repaired
             replies.send(Reply(saved, str(repaired) if repaired and repaired.problems else ""))
+            os.nice(NICENESS)  # only now: somebody waits for the dataset to be opened
             for name, *arguments in iter(lambda: _receive(commands), None):
                 _carry_out(dataset, name, arguments)
                 saved = dataset.episodes

@@ -10,7 +10,8 @@ from huggingface_hub.utils import validate_repo_id
 
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
 from relmm.errors import ConfigError, DatasetError
-from relmm.features import DEPTH_KEY, FPS, IMAGE_KEY, STATE_KEY, dataset_features
+from relmm.features import DEPTH_KEY, FPS, IMAGE_KEY, SCAN_NAMES, STATE_KEY, STATE_NAMES, dataset_features
+from relmm.geometry import camera_info
 
 # The columns that LeRobot adds by itself.
 LEROBOT_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -26,13 +27,14 @@ TRAINING_COLUMNS = (
     "complementary_info.grasp_probability",
     "complementary_info.robot_time",
 )
+_STATE_NAMES_0_1_0 = [name for name in STATE_NAMES if name not in ("y.vel", *SCAN_NAMES)]
 FORMAT_VERSION = "v3.0"  # LeRobot's, also the tag of datasets on the Hub
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"  # LeRobot's
 
 
-def features_to_store(depth: bool) -> dict[str, dict[str, Any]]:
-    """The schema as LeRobot stores it, with the unit of the depth picture."""
-    features = dataset_features(depth)
+def features_to_store(depth: bool, camera: str | None) -> dict[str, dict[str, Any]]:
+    """The schema as LeRobot stores it, with the unit of the depth picture; `camera` is its name, if it is known."""
+    features = dataset_features(depth, None if camera is None else camera_info(camera))
     if depth:
         features[DEPTH_KEY]["info"]["depth_unit"] = "mm"
     return features
@@ -73,7 +75,7 @@ def check_new(root: Path, repo_id: str) -> None:
 
 def check_resume(
     root: Path, repo_id: str, depth: bool | None, robot_type: str | None, info: dict[str, Any] | None
-) -> bool:
+) -> None:
     """Refuse a folder that cannot be continued with these settings; reads only.
 
     Args:
@@ -83,37 +85,39 @@ def check_resume(
         robot_type: the robot it must be of; None takes it as it is.
         info: what the run is recorded with; its `camera` must be that of the dataset.
 
-    Returns:
-        Whether the dataset has the depth picture.
-
     Raises:
-        ConfigError: LeRobot or the Hub would refuse the name.
+        ConfigError: LeRobot or the Hub would refuse the name, or an unknown camera.
         DatasetError: no relmm dataset, or one with other settings: each difference is spelled out.
     """
     check_repo_id(repo_id)
     have = _stored_settings(DatasetFolder(root))
-    has_depth = DEPTH_KEY in have["features"] if depth is None else depth
+    features = have["features"]
+    _refuse_old(root, features)
     differences = _differences("fps", have["fps"], FPS)
-    differences += _feature_differences(have["features"], dataset_features(has_depth))
+    differences += _feature_differences(features, dataset_features(DEPTH_KEY in features if depth is None else depth))
     if robot_type is not None:
         differences += _differences("robot type", have["robot_type"], robot_type)
-    if info is not None and "camera" in info and have["camera"] is not None:
-        differences += _differences("camera", have["camera"], info["camera"])
+    if info is not None and "camera" in info:
+        differences += [f"camera: have {there}, want {here}" for there, here in _cameras(features, info["camera"])]
     if differences:
         raise DatasetError(
             f"{root} cannot be continued with these settings: {'; '.join(differences)}; "
             "record into a new folder, or use the settings of this one."
         )
-    return has_depth
 
 
-def check_trainable(root: Path | str) -> None:
+def check_trainable(root: Path | str, camera: str | None = None) -> None:
     """Refuse a dataset that relmm cannot learn from; reads `info.json` only, so it may have any number of episodes.
 
     More columns than `TRAINING_COLUMNS` are welcome.
 
+    Args:
+        root: the dataset.
+        camera: that of the policy, None for any; a dataset that does not tell its own may have it.
+
     Raises:
-        DatasetError: no LeRobot dataset, or of another format, frame rate or columns: each difference is spelled out.
+        DatasetError: no LeRobot dataset, of relmm 0.1.0, of another camera, or of another format, frame rate or
+            columns: each difference is spelled out.
     """
     info = DatasetFolder(root).read_json(INFO) or {}
     if not {"features", "fps", "codebase_version"} <= info.keys() or not isinstance(info["features"], dict):
@@ -122,6 +126,7 @@ def check_trainable(root: Path | str) -> None:
             "or the name of one on the Hub."
         )
     have, want = info["features"], dataset_features()
+    _refuse_old(root, have)
     differences = []
     if str(info["codebase_version"]).split(".")[0] != FORMAT_VERSION.split(".")[0]:
         differences += _differences("format", info["codebase_version"], FORMAT_VERSION)
@@ -135,9 +140,16 @@ def check_trainable(root: Path | str) -> None:
             f"{root} cannot be trained on: {'; '.join(differences)}; choose a dataset that relmm has recorded, "
             "or record one with relmm-record."
         )
+    for there, here in _cameras(have, camera):
+        raise DatasetError(
+            f"{root} was recorded with the camera {there}, but the policy's is {here}; choose another dataset, or set "
+            "--policy.camera to the dataset's."
+        )
 
 
-def add_run(folder: DatasetFolder, depth: bool, robot_type: str | None, episode: int, info: dict[str, Any]) -> None:
+def add_run(
+    folder: DatasetFolder, features: dict[str, Any], robot_type: str | None, episode: int, info: dict[str, Any]
+) -> None:
     """Write down in `meta/relmm.json` with what the episodes from `episode` on are recorded.
 
     The file also keeps what `info.json` cannot be rebuilt without.
@@ -146,7 +158,7 @@ def add_run(folder: DatasetFolder, depth: bool, robot_type: str | None, episode:
     settings = {
         "robot_type": robot_type,
         "fps": FPS,
-        "features": features_to_store(depth),
+        "features": {key: feature for key, feature in features.items() if key not in LEROBOT_COLUMNS},
         "runs": [*runs, {"first_episode": episode, **info}],
     }
     folder.write_json(RELMM, settings)
@@ -155,16 +167,39 @@ def add_run(folder: DatasetFolder, depth: bool, robot_type: str | None, episode:
 def _stored_settings(folder: DatasetFolder) -> dict[str, Any]:
     if not folder.root.is_dir():
         raise DatasetError(f"there is no dataset at {folder.root}; check the folder, or record without resuming.")
-    own = folder.read_json(RELMM) or {}
-    settings = folder.read_json(INFO) or own
+    settings = folder.read_json(INFO) or folder.read_json(RELMM) or {}
     if not {"features", "fps", "robot_type"} <= settings.keys() or not isinstance(settings["features"], dict):
         raise DatasetError(
             f"{folder.root} is no LeRobot dataset, it has no readable {INFO}; choose the folder of a dataset, "
             "or a folder that does not exist yet to record a new one."
         )
-    runs = own.get("runs", [])
-    camera = next((run["camera"] for run in reversed(runs) if "camera" in run), None)
-    return {**{key: settings[key] for key in ("features", "fps", "robot_type")}, "camera": camera}
+    return settings
+
+
+def _refuse_old(root: Path | str, features: dict[str, Any]) -> None:
+    state = features.get(STATE_KEY)
+    if isinstance(state, dict) and state.get("names") == _STATE_NAMES_0_1_0:
+        raise DatasetError(
+            f"{root} was recorded by relmm 0.1.0, its {STATE_KEY} has no y.vel and no {SCAN_NAMES[0]} to "
+            f"{SCAN_NAMES[-1]}; choose a newer dataset, or read it with relmm 0.1.0."
+        )
+
+
+def _cameras(features: dict[str, Any], wanted: str | None) -> list[tuple[str, str]]:
+    """The camera of a dataset and the wanted one, in words, if both are known and differ."""
+    feature = features.get(IMAGE_KEY)
+    info = feature.get("info") if isinstance(feature, dict) else None
+    have = info.get("camera") if isinstance(info, dict) else None
+    want = None if wanted is None else camera_info(wanted)
+    return [] if None in (have, want) or have == want else [(describe_camera(have), describe_camera(want))]
+
+
+def describe_camera(camera: Any) -> str:
+    """The camera of a picture's `info` in words."""
+    if not isinstance(camera, dict):
+        return repr(camera)
+    details = ", ".join(f"{key} {value}" for key, value in camera.items() if key != "name")
+    return f"{camera.get('name')} ({details})"
 
 
 def _feature_differences(have: dict[str, Any], want: dict[str, Any]) -> list[str]:

@@ -13,7 +13,7 @@ from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, STATS, TASKS,
 from relmm.episodes.repair import RepairReport, repair
 from relmm.episodes.settings import add_run, check_new, check_resume, features_to_store
 from relmm.errors import DatasetError
-from relmm.features import DEPTH_KEY, FPS
+from relmm.features import FPS
 
 # Tasks before the data that refers to them, and the counters of info.json when everything else is there.
 PUBLISHING_ORDER = (TASKS, DATA_FILES, EPISODE_FILES, STATS, INFO)
@@ -57,10 +57,12 @@ class DurableDataset:
             info: what the run is recorded with (room, camera, seed, policy ...), kept in `meta/relmm.json`.
 
         Raises:
-            ConfigError: the Hub would refuse the name.
+            ConfigError: the Hub would refuse the name, or an unknown camera.
             DatasetError: the folder exists, or cannot be written.
         """
         check_new(Path(root), repo_id)
+        info = info or {}
+        features = features_to_store(depth, info.get("camera"))
         folder = DatasetFolder(root)
         try:
             folder.root.mkdir(parents=True)
@@ -68,8 +70,8 @@ class DurableDataset:
         except OSError as error:
             raise DatasetError(_cannot_write(folder.root, error, 0)) from error
         try:
-            add_run(folder, depth, robot_type, 0, info or {})
-            dataset = _create_staged(folder, repo_id, depth, robot_type)
+            add_run(folder, features, robot_type, 0, info)
+            dataset = _create_staged(folder, repo_id, features, robot_type)
         except OSError as error:
             folder.unlock()
             raise DatasetError(_cannot_write(folder.root, error, 0)) from error
@@ -98,7 +100,7 @@ class DurableDataset:
             ConfigError: the Hub would refuse the name.
             DatasetError: no relmm dataset, other settings, another writer, or beyond repair.
         """
-        has_depth = check_resume(Path(root), repo_id, depth, robot_type, info)
+        check_resume(Path(root), repo_id, depth, robot_type, info)
         folder = DatasetFolder(root)
         try:
             folder.lock()
@@ -108,7 +110,8 @@ class DurableDataset:
             report = repair(folder)
             dataset = _resume_staged(folder, repo_id)
             if info is not None:
-                add_run(folder, has_depth, dataset.meta.robot_type, dataset.meta.total_episodes, info)
+                meta = dataset.meta
+                add_run(folder, meta.features, meta.robot_type, meta.total_episodes, info)
         except OSError as error:
             folder.unlock()
             raise DatasetError(_cannot_write(folder.root, error, None)) from error
@@ -201,13 +204,13 @@ def _cannot_write(root: Path, error: Exception, episodes: int | None) -> str:
     return f"{root} cannot be written ({reason}); {saved}make room or check the permissions, then resume."
 
 
-def _create_staged(folder: DatasetFolder, repo_id: str, depth: bool, robot_type: str) -> Any:
+def _create_staged(folder: DatasetFolder, repo_id: str, features: dict[str, Any], robot_type: str) -> Any:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = LeRobotDataset.create(
         repo_id,
         fps=FPS,
-        features=features_to_store(depth),
+        features=features,
         root=folder.staging,
         robot_type=robot_type,
         use_videos=False,
@@ -226,7 +229,7 @@ def _resume_staged(folder: DatasetFolder, repo_id: str) -> Any:
     if not last:  # lerobot 0.6.0 would look for the missing files on the Hub
         info = folder.read_json(INFO)
         assert info is not None  # repaired
-        return _create_staged(folder, repo_id, DEPTH_KEY in info["features"], info["robot_type"])
+        return _create_staged(folder, repo_id, info["features"], info["robot_type"])
     for name in [INFO, *(name for name in (STATS, TASKS, *last) if (folder.root / name).is_file())]:
         (folder.staging / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(folder.root / name, folder.staging / name)

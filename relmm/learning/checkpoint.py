@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save_file
 from relmm.episodes.folder import sync
 from relmm.errors import ConfigError
 from relmm.learning.actor import Actor
-from relmm.learning.learner import Learner
+from relmm.policies.learning import Learner
 
 _MODEL, _STATE, _LAST = "pretrained_model", "training_state", "last"
 _COUNTERS, _RANDOM = "relmm_state.json", "relmm_rng.safetensors"
@@ -54,8 +54,7 @@ def save_checkpoint(
     save_training_state(temporary, step, learner.optimizers)
     states = {"trainer": rng.bit_generator.state, "learner": learner.rng.bit_generator.state}
     _write_json(temporary / _STATE / _COUNTERS, {"counters": counters, "random": states})
-    generators = {"policy": learner.policy.rng.get_state(), "noise": learner.noise.get_state()}
-    save_file(generators, temporary / _STATE / _RANDOM)
+    save_file({"noise": learner.noise.get_state()}, temporary / _STATE / _RANDOM)
     _sync_tree(temporary)
     if target.exists():  # the same step again: the link must never point to what is being removed
         _link(folder / _LAST, temporary.name)
@@ -152,9 +151,7 @@ def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[st
         load_optimizer_state(learner.optimizers, checkpoint / _STATE)
         _check_optimizers(learner)
         state = json.loads((checkpoint / _STATE / _COUNTERS).read_text(encoding="utf-8"))
-        generators = load_file(checkpoint / _STATE / _RANDOM)
-        learner.policy.rng.set_state(generators["policy"])
-        learner.noise.set_state(generators["noise"])
+        learner.noise.set_state(load_file(checkpoint / _STATE / _RANDOM)["noise"])
         rng.bit_generator.state = state["random"]["trainer"]
         learner.rng.bit_generator.state = state["random"]["learner"]
         counters: dict[str, Any] = {key: _count(key, value) for key, value in state["counters"].items()}
@@ -203,7 +200,7 @@ def check_same_networks(checkpoint: Path, wanted: dict[str, Any]) -> None:
 
     Args:
         checkpoint: its folder.
-        wanted: `ReLMMConfig.fingerprint` of this run.
+        wanted: `LearningConfig.fingerprint` of this run.
 
     Raises:
         ConfigError: with the differences.

@@ -7,7 +7,6 @@ import numpy as np
 from relmm.features import Phase
 from relmm.learning.actor import Actor
 from relmm.learning.life import EpisodeResult, Life
-from relmm.learning.pseudo_reset import pseudo_reset
 
 
 class Collector:
@@ -24,15 +23,18 @@ class Collector:
         self._life, self._actor, self._rng, self._pseudo_reset_steps = life, actor, rng, pseudo_reset_steps
 
     def episode(self) -> EpisodeResult:
-        """Run one episode; what a recorder raises comes through."""
-        self._actor.reset()
+        """Run one episode; what a recorder raises comes through. The policy remembers what it saw in earlier ones."""
         ended = self._life.holding and self._pseudo_reset()
         while not ended:
             action = self._actor.act(self._life.observation)
-            ended = self._life.step(action, Phase.LEARNING, self._actor.grasp_probability)
+            ended = self._life.step(action, Phase.LEARNING, self._actor.belief)
         return self._life.last_episode
 
     def _pseudo_reset(self) -> bool:
         """Whether the episode was cut off."""
-        actions = pseudo_reset(self._rng, self._pseudo_reset_steps, lambda: self._life.holding)
-        return any(self._life.step(action, Phase.PSEUDO_RESET) for action in actions)
+        self._actor.watch(self._life.observation)
+        for action in self._actor.pseudo_reset(self._rng, self._pseudo_reset_steps, lambda: self._life.holding):
+            if self._life.step(action, Phase.PSEUDO_RESET, self._actor.belief):
+                return True
+            self._actor.watch(self._life.observation)
+        return False

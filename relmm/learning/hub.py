@@ -80,10 +80,11 @@ def upload_checkpoint(
         The commit.
 
     Raises:
-        ConfigError: the Hub would refuse the name, or the checkpoint is damaged.
+        ConfigError: the Hub would refuse the name, or the checkpoint is damaged, or of relmm 0.1.0.
         HubError: the upload has failed, or the repository holds another run.
     """
     check_repo_id(repo_id)
+    check_policy_folder(pretrained_model(checkpoint))
     step = read_json(training_state(checkpoint) / "training_step.json")["step"]
     source = Source(step, None, None, 0, runs)
     if dataset is not None:

@@ -6,18 +6,21 @@ limit. So its last frame is the only one that is done or truncated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 from lerobot.robots.robot import Robot
 
-from relmm.features import FREE_GRASPS, Phase, Skill
+from relmm.features import BELIEF, DRIVE_PULSE_S, FREE_GRASPS, MOTION_NAMES, ODOMETRY, FloatArray, Phase, Skill
+from relmm.geometry import moved
 from relmm.learning.actor import TASK
 
 
 class Recorder(Protocol):
-    """Where frames go; `relmm.episodes.EpisodeRecorder` and `relmm.learning.replay.Replay` are two."""
+    """Where frames go; `relmm.episodes.EpisodeRecorder` and `relmm.policies.learning.Learner` are two."""
 
     def add_frame(
         self, observation: dict[str, Any], action: dict[str, float], outcome: dict[str, Any], task: str
@@ -57,6 +60,7 @@ class Life:
 
     Attributes:
         observation: the robot's last.
+        pose: x, y (m) and heading (rad, not wrapped) by the robot's own wheels since this life began.
         episode: what has happened in the running episode.
         succeeded: whether the last step picked something up.
     """
@@ -73,6 +77,7 @@ class Life:
         self._max_steps, self.should_stop = max_steps, should_stop
         self._grasps_in_a_row = 0
         self.observation: dict[str, Any] = robot.get_observation()
+        self.pose: FloatArray = np.zeros(3)
         self.episode = EpisodeResult()
         self.succeeded = False
 
@@ -85,20 +90,22 @@ class Life:
         """Take a new observation, after someone else has changed the room."""
         self.observation = self._robot.get_observation()
 
-    def step(self, action: dict[str, float], phase: Phase, grasp_probability: float = -1.0) -> bool:
+    def step(self, action: dict[str, float], phase: Phase, belief: Mapping[str, float] | None = None) -> bool:
         """Act, look, record.
 
         Args:
             action: one skill.
             phase: why.
-            grasp_probability: P[grasp] of the observation before, -1 if nobody asked.
+            belief: what the action was based on, by the names of `relmm.features.BELIEF`; those missing count as -1.
 
         Returns:
             Whether the episode has ended with this frame; its result is then in `last_episode`.
         """
         before, seconds = self.observation, self._clock()
+        odometry = (*self.pose[:2].tolist(), math.degrees(self.pose[2]))
         done_action = self._robot.send_action(action)
         self.observation = self._robot.get_observation()
+        self.pose = moved(self.pose, _motion(self.observation))
         grasped = done_action["skill.pos"] == Skill.GRASP
         self._count(grasped, phase)
         success = self.succeeded = grasped and self.holding
@@ -109,7 +116,8 @@ class Life:
             "next.truncated": truncated,
             "next.success": success,
             "complementary_info.phase": int(phase),
-            "complementary_info.grasp_probability": grasp_probability,
+            **{f"complementary_info.{name}": (belief or {}).get(name, -1.0) for name in BELIEF},
+            **{f"complementary_info.{name}": value for name, value in zip(ODOMETRY, odometry, strict=True)},
             "complementary_info.robot_time": seconds,
         }
         for recorder in self._recorders:
@@ -131,3 +139,9 @@ class Life:
         self.episode.success = success
         self.last_episode, self.episode = self.episode, EpisodeResult()
         self._grasps_in_a_row = 0
+
+
+def _motion(observation: dict[str, Any]) -> FloatArray:
+    """Forward, left (m) and turn (rad) of the last skill."""
+    forward, left, turn = (observation[name] * DRIVE_PULSE_S for name in MOTION_NAMES)
+    return np.array([forward, left, math.radians(turn)])

@@ -8,7 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from relmm.features import Phase, Skill
+from relmm.episodes.follow import Episode
+from relmm.features import ACTION_NAMES, Phase, Skill
+
+_SKILL = ACTION_NAMES.index("skill.pos")
 
 
 @dataclass
@@ -22,6 +25,7 @@ class Progress:
         objects: picked up outside a curriculum.
         pseudo_reset_steps: navigation steps of pseudo-resets.
         interventions: times that a person had to put an object into reach.
+        robot_minutes: on the robot's own clock, over all its lives; the last frame is not over yet.
     """
 
     steps: int = 0
@@ -31,15 +35,25 @@ class Progress:
     objects: int = 0
     pseudo_reset_steps: int = 0
     interventions: int = 0
+    robot_minutes: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._time = 0.0  # s on the robot's clock, at the last frame
 
     def add_frame(
         self, observation: dict[str, Any], action: dict[str, float], outcome: dict[str, Any], task: str
     ) -> None:
         """Take one frame, as `relmm.episodes.EpisodeRecorder.add_frame` does."""
-        self.add(action["skill.pos"], outcome["next.reward"] > 0, outcome["complementary_info.phase"])
+        time = outcome["complementary_info.robot_time"]
+        self._add(action["skill.pos"], outcome["next.reward"] > 0, outcome["complementary_info.phase"], time)
 
-    def add(self, skill: float, success: bool, phase: int) -> None:
-        """Count one frame."""
+    def read(self, episode: Episode) -> None:
+        """Count the frames of a recorded episode."""
+        columns = (episode.actions[:, _SKILL], episode.rewards > 0, episode.phases, episode.robot_times)
+        for skill, success, phase, time in zip(*columns, strict=True):
+            self._add(float(skill), bool(success), int(phase), float(time))
+
+    def _add(self, skill: float, success: bool, phase: int, time: float) -> None:
         grasped, drove = round(skill) == Skill.GRASP, round(skill) == Skill.NAVIGATE
         self.steps += drove and phase == Phase.LEARNING
         self.practice_attempts += grasped and phase == Phase.CURRICULUM
@@ -47,11 +61,14 @@ class Progress:
         self.successes += bool(success)
         self.objects += bool(success) and phase == Phase.LEARNING
         self.pseudo_reset_steps += drove and phase == Phase.PSEUDO_RESET
+        # The clock begins anew with each life of the robot.
+        self.robot_minutes += (time - self._time if time >= self._time else time) / 60
+        self._time = time
 
     def save_episode(self) -> None:
         """Nothing to do."""
 
-    def asdict(self) -> dict[str, int]:
+    def asdict(self) -> dict[str, float]:
         """By name, for logs."""
         return asdict(self)
 

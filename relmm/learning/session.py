@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from relmm.learning.learner import Learner, RecordedEpisode
+from relmm.episodes.follow import Episode
 from relmm.learning.progress import Metrics, Progress
 from relmm.learning.trainer import Trainer
+from relmm.policies.learning import Learner
 
 
 @dataclass(frozen=True)
@@ -73,15 +74,13 @@ class Session:
             self._after(before)
         self._checkpoint()
 
-    def follow(self, episodes: Iterable[RecordedEpisode]) -> None:
+    def follow(self, episodes: Iterable[Episode]) -> None:
         """Train on episodes that come in from elsewhere, until the last step or the last of them."""
         self._begin()
         for episode in episodes:
             before = self._progress.steps
-            for action, reward, phase in zip(episode.actions, episode.rewards, episode.phases, strict=True):
-                self._progress.add(float(action[2]), bool(reward > 0), int(phase))
+            self._progress.read(episode)
             self._learner.read(episode, update=True)
-            self._progress.save_episode()
             self._after(before, save=True)
             if self._progress.steps >= self._schedule.steps:
                 break

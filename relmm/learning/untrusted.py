@@ -50,10 +50,28 @@ def check_policy_folder(folder: Path) -> None:
             f"{folder / CONFIG} is of a policy {kind!r}, and relmm's commands load {', '.join(own)}; "
             "use lerobot-eval for policies of others."
         )
+    refuse_first_version(config, folder / CONFIG)
     for name in PROCESSORS:
         _check_processor(folder / name, read_json(folder / name))
     if not (folder / WEIGHTS).is_file():
         raise ConfigError(f"{folder} has no {WEIGHTS}: give the folder of a checkpoint's pretrained_model.")
+
+
+def refuse_first_version(config: Mapping[str, Any], path: Path) -> None:
+    """Refuse what relmm 0.1.0 called `relmm`: a grasp ensemble with soft actor-critic, or the paper's networks.
+
+    Args:
+        config: of a policy.
+        path: of its file.
+
+    Raises:
+        ConfigError: it is one of those.
+    """
+    if config.get("type") == "relmm" and "navigation_encoder" in config:
+        raise ConfigError(
+            f"{path} is of relmm 0.1.0, whose policy relmm had other networks than this version's; use it with relmm "
+            "0.1.0, or train anew."
+        )
 
 
 def read_json(path: Path) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,14 +30,13 @@ from relmm.features import (
     BASKET_XY,
     IMAGE_KEY,
     IMAGE_SIZE,
-    MAX_THETA_VEL,
-    MAX_X_VEL,
     STATE_KEY,
     STATE_NAMES,
     Skill,
     action_dict,
     cell_to_xy,
 )
+from relmm.policies.pseudo_reset import random_pseudo_reset
 
 _HOLDING = STATE_NAMES.index("holding.pos")
 
@@ -113,10 +113,20 @@ class ControllerConfig(PreTrainedConfig):
 
 @dataclass
 class Row:
-    """What a policy remembers about one robot of a batch."""
+    """What a policy remembers about one robot of a batch.
+
+    Attributes:
+        rng: of its random choices.
+        attempts: grasps since the last navigation step.
+        observed: whether the present observation has been taken in already.
+        belief: what the last decision was based on, by `relmm.features.BELIEF`; empty without an opinion.
+        memory: whatever else.
+    """
 
     rng: np.random.Generator
-    attempts: int = 0  # grasps since the last navigation step
+    attempts: int = 0
+    observed: bool = False
+    belief: dict[str, float] = field(default_factory=dict)
     memory: dict[str, Any] = field(default_factory=dict)
 
 
@@ -133,15 +143,48 @@ class ControllerPolicy(PreTrainedPolicy):
         self._rows: list[Row] = []
         self._episodes = 0
 
-    @abstractmethod
-    def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
-        """Choose the next action of a robot with empty hands.
+    def observe(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> None:
+        """Take in an observation; to be called once with each, whoever decides what is done next.
 
         Args:
             image: the front camera, (100, 100, 3).
             state: by `relmm.features.STATE_NAMES`.
             row: what is remembered about this robot.
         """
+
+    @abstractmethod
+    def decide(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
+        """Choose the next action of a robot with empty hands, after `observe`.
+
+        Args:
+            image: the front camera, (100, 100, 3).
+            state: by `relmm.features.STATE_NAMES`.
+            row: what is remembered about this robot.
+        """
+
+    def pseudo_reset(self, row: Row, steps: int, holding: Callable[[], bool]) -> Iterator[dict[str, float]]:
+        """The actions that carry what is held to somewhere else and put it down there.
+
+        Args:
+            row: what is remembered about this robot; `observe` is to be called between the actions.
+            steps: navigation steps before and after the object is put down.
+            holding: whether something is in the gripper now.
+        """
+        return random_pseudo_reset(row.rng, steps, holding)
+
+    def describe(self, action: dict[str, float], row: Row) -> str:
+        """What an action is for, in a few words for people."""
+        match Skill(round(action["skill.pos"])):
+            case Skill.GRASP:
+                return "grasps"
+            case Skill.PLACE:
+                return "puts it down"
+            case _:
+                return f"drives at {action['x.vel']:.2f} m/s" if action["x.vel"] > 0 else "turns"
+
+    def picture(self, row: Row) -> NDArray[np.uint8] | None:
+        """What is thought about a robot's surroundings, to look at, uint8 (height, width, 3); None for nothing."""
+        return None
 
     def reset(self) -> None:
         """Begin new episodes."""
@@ -157,19 +200,27 @@ class ControllerPolicy(PreTrainedPolicy):
         """
         if batch[STATE_KEY].shape[-1] != len(STATE_NAMES):  # numbers of other things at the places of those it reads
             raise ConfigError(
-                f"{STATE_KEY} holds {batch[STATE_KEY].shape[-1]} numbers instead of the {len(STATE_NAMES)} of "
-                f"{', '.join(STATE_NAMES)}; if this is lerobot-rollout of lerobot 0.6.0, which drops velocities, "
-                "install lerobot 0.6.1."
+                f"{STATE_KEY} holds {batch[STATE_KEY].shape[-1]} numbers instead of {len(STATE_NAMES)}, "
+                f"{STATE_NAMES[0]} to {STATE_NAMES[-1]}; if this is lerobot-rollout of lerobot 0.6.0, which drops "
+                "velocities, install lerobot 0.6.1."
             )
         images = (batch[IMAGE_KEY] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
         states = batch[STATE_KEY].float().cpu().numpy()
-        while len(self._rows) < len(images):
-            stream = [self.config.seed or 0, self._episodes + len(self._rows)]
-            self._rows.append(Row(np.random.default_rng(stream)))
-        actions = [self._act(*each) for each in zip(images, states, self._rows, strict=False)]
+        rows = [self.row(index) for index in range(len(images))]
+        actions = [self._act(*each) for each in zip(images, states, rows, strict=True)]
         return torch.tensor([[action[name] for name in ACTION_NAMES] for action in actions])
 
+    def row(self, index: int) -> Row:
+        """What is remembered about a robot of the batch."""
+        while len(self._rows) <= index:
+            stream = [self.config.seed or 0, self._episodes + len(self._rows)]
+            self._rows.append(Row(np.random.default_rng(stream)))
+        return self._rows[index]
+
     def _act(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> dict[str, float]:
+        if not row.observed:
+            self.observe(image, state, row)
+        row.observed = False
         if state[_HOLDING] > 0.5:
             row.attempts = 0
             return action_dict(Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
@@ -210,11 +261,6 @@ def grasp_cell(cell: int) -> dict[str, float]:
     """The action that grasps at the centre of a cell."""
     x, y = cell_to_xy(cell)
     return action_dict(Skill.GRASP, x=float(x), y=float(y))
-
-
-def drive_anywhere(rng: np.random.Generator) -> dict[str, float]:
-    """A navigation step drawn uniformly from all of them."""
-    return action_dict(x_vel=rng.uniform(0, MAX_X_VEL), theta_vel=rng.uniform(-MAX_THETA_VEL, MAX_THETA_VEL))
 
 
 def make_identity_processors(

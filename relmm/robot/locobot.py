@@ -16,6 +16,7 @@ from relmm.errors import RobotError
 from relmm.features import (
     ACTION_NAMES,
     BASKET_XY,
+    DRIVE_PULSE_S,
     FRONT,
     FRONT_DEPTH,
     GRASP_X,
@@ -153,11 +154,12 @@ class LocobotRobot(Robot):
         state, skills = self.body.state(), self.skills
         rgb, depth = skills.picture()
         values = [
-            *skills.last_velocity,
+            *skills.motion() / DRIVE_PULSE_S,
             *np.degrees(state.joints),
             state.gripper,
             float(skills.holding),
             float(skills.bumper),
+            *skills.scan(),
         ]
         observation: dict[str, Any] = dict(zip(STATE_NAMES, map(float, values), strict=True))
         observation[FRONT] = rgb

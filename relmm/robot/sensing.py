@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relmm.features import FloatArray
+from relmm.features import SCAN_BEARINGS, SCAN_RANGE, FloatArray
 from relmm.geometry import ARM_BASE, TOOL_LENGTH, CameraGeometry, arm_forward
 from relmm.robot.body import BodyState
 
@@ -26,6 +26,8 @@ OBSTACLE_HEIGHT = (0.08, 0.70)  # m; lower things are objects, higher ones pass 
 OBSTACLE_RADIUS = 0.37  # m from the robot's centre: the near half of the graspable area and the way there
 OWN_RADIUS = 0.23  # m; nearer points are the robot's own arm at rest and what it carries
 _MIN_POINTS = 6  # pixels; fewer are noise
+_SCAN_POINTS = 3  # the same in one sector of a scan
+_SECTOR = SCAN_BEARINGS[1] - SCAN_BEARINGS[0]  # degrees
 _ARM_REACH = 0.65  # m from the robot's centre; no part of the arm gets farther
 _ARM_HALF_WIDTH, _ARM_HALF_THICKNESS = 0.045, 0.025  # m, of the open gripper, with 7 mm to spare
 _FINGERTIP = 0.012  # m beyond the point between the pads
@@ -68,6 +70,9 @@ def sees_held_object(depth: Depth, camera: CameraGeometry, joints: FloatArray, o
 class ObstacleDetector:
     """Says from one depth picture whether something stands in the graspable area (paper, App. "Collision Avoidance").
 
+    Also whether something stands in the arm's way, and how far away something stands in each direction: always things
+    that are higher than the objects.
+
     Each pixel's ray is fixed to the robot, so the interval of depths that would put its point inside the zone is
     computed once; a picture then costs two comparisons a pixel.
     """
@@ -98,11 +103,37 @@ class ObstacleDetector:
             depth: mm, (height, width), with the arm at rest.
             poses: of the arm on its way, rad, each of shape (5,).
         """
+        points, distances = self._points(depth)
+        points = points[distances < _ARM_REACH]
+        return len(points) >= _MIN_POINTS and any(_points_in_arm(points, pose) >= _MIN_POINTS for pose in poses)
+
+    def scan(self, depth: Depth) -> FloatArray:
+        """How far the nearest thing higher than the objects is in each direction, m, by `relmm.features.SCAN_NAMES`.
+
+        As ROS's depthimage_to_laserscan does for one row, but for all heights that would stop the robot, and measured
+        from the robot's centre.
+
+        Args:
+            depth: mm, (height, width), with the arm at rest.
+        """
+        points, distances = self._points(depth)
+        sectors = np.rint((np.degrees(np.arctan2(points[:, 1], points[:, 0])) - SCAN_BEARINGS[0]) / _SECTOR).astype(int)
+        inside = (points[:, 2] < OBSTACLE_HEIGHT[1]) & (sectors >= 0) & (sectors < len(SCAN_BEARINGS))
+        sectors, distances = sectors[inside], distances[inside]
+        order = np.lexsort((distances, sectors))
+        seen, first, count = np.unique(sectors[order], return_index=True, return_counts=True)
+        enough = count >= _SCAN_POINTS
+        scan = np.full(len(SCAN_BEARINGS), SCAN_RANGE)
+        scan[seen[enough]] = distances[order][first[enough] + _SCAN_POINTS - 1]
+        return np.minimum(scan, SCAN_RANGE)
+
+    def _points(self, depth: Depth) -> tuple[FloatArray, FloatArray]:
+        """Points that are higher than the objects and not the robot's own: m, (n, 3), and their distances."""
         high = (depth > 0) & (depth < self._over_objects)
         points = self._origin + self._rays[high] * (depth[high, None] / 1000.0)
-        radius = np.hypot(points[:, 0], points[:, 1])
-        points = points[(radius > OWN_RADIUS) & (radius < _ARM_REACH)]
-        return len(points) >= _MIN_POINTS and any(_points_in_arm(points, pose) >= _MIN_POINTS for pose in poses)
+        distances = np.hypot(points[:, 0], points[:, 1])
+        beside = distances > OWN_RADIUS
+        return points[beside], distances[beside]
 
 
 def _points_in_arm(points: FloatArray, joints: FloatArray) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relmm.features import BASKET_XY, DRIVE_PULSE_S, MAX_THETA_VEL, NAVIGATION_STEP_S, FloatArray
-from relmm.geometry import arm_inverse
+from relmm.geometry import arm_inverse, moved
 from relmm.robot.body import MAX_OPENING, Body
 from relmm.robot.sensing import ContactDetector, ObstacleDetector, grips_something, sees_held_object
 
@@ -61,10 +61,10 @@ class Skills:
         self._picture: tuple[NDArray[np.uint8], NDArray[np.uint16]] | None = None
         self._grasped = False
         self._closed = False
-        # m/s and deg/s, from the wheel encoders: how far the last navigation step has moved the robot, turns away from
-        # obstacles included, divided by the length of a drive pulse.
-        self.last_velocity = (0.0, 0.0)
-        self.bumper = 0  # bits pressed during the last navigation step
+        state = body.state()
+        self._wheels = (state.travelled, state.heading)  # m and degrees, at the last look
+        self._motion: FloatArray = np.zeros(3)  # m forward, m left and rad, of the last skill, by the wheels
+        self.bumper = 0  # bits pressed during the last skill
 
     @property
     def holding(self) -> bool:
@@ -76,6 +76,14 @@ class Skills:
         if self._picture is None:
             self._picture = self._body.capture()
         return self._picture
+
+    def motion(self) -> FloatArray:
+        """How far the wheels moved the base during the last skill: m forward, m left, degrees, shape (3,)."""
+        return self._motion * (1.0, 1.0, np.degrees(1.0))
+
+    def scan(self) -> FloatArray:
+        """The nearest thing in the way in each direction, see `relmm.features.SCAN_NAMES`."""
+        return self._detector.scan(self.picture()[1])
 
     def forget_picture(self) -> None:
         """Take a new picture next time, because someone else has changed the room."""
@@ -93,8 +101,7 @@ class Skills:
             x_vel: m/s.
             theta_vel: deg/s, positive = left.
         """
-        self.bumper = 0
-        before = self._body.state()
+        self._begin()
         self._pulse(x_vel, theta_vel)
         bumped = self.bumper != 0
         if bumped:
@@ -102,9 +109,6 @@ class Skills:
             self._wait(_BACK_OFF_S)
             self._brake()
         self._turn_until_clear(at_least_once=bumped)
-        after = self._body.state()
-        travelled, turned = after.travelled - before.travelled, after.heading - before.heading
-        self.last_velocity = (travelled / DRIVE_PULSE_S, turned / DRIVE_PULSE_S)
 
     def grasp(self, x: float, y: float) -> bool:
         """Try to pick up what lies at a point of the floor (m, robot frame), and say whether it worked.
@@ -112,6 +116,7 @@ class Skills:
         A failed attempt ends at rest with open fingers, a successful one at rest with the object held. Where something
         stands in the arm's way nothing moves, and where the arm meets something it goes back: the attempt has failed.
         """
+        self._begin()
         above = arm_inverse(x, y, _ABOVE_Z, _DOWN)
         if self._obstructs(REST_POSE, above, _RAISED_POSE, PRESENT_POSE):
             return False
@@ -127,6 +132,7 @@ class Skills:
 
         It stays held where something stands in the arm's way, or where the arm meets something before it is there.
         """
+        self._begin()
         above = arm_inverse(x, y, _ABOVE_Z, _DOWN)
         if self._obstructs(REST_POSE, above):
             return
@@ -138,6 +144,7 @@ class Skills:
 
     def place_in_basket(self) -> None:
         """Drop the held object into the basket at the robot's side."""
+        self._begin()
         for pose in (_BESIDE_BASKET, _OVER_BASKET, _IN_BASKET):
             self._move(pose)
         self._release()
@@ -217,6 +224,16 @@ class Skills:
                 return True
         return False
 
+    def _begin(self) -> None:
+        self.bumper = 0
+        self._motion = np.zeros(3)
+
     def _wait(self, seconds: float) -> None:
         self._picture = None
         self._body.wait(seconds)
+        state, (travelled, heading) = self._body.state(), self._wheels
+        forward, turn = state.travelled - travelled, math.radians(state.heading - heading)
+        # The way from one end of an arc to the other points half of its turn aside.
+        part = np.array([forward * math.cos(turn / 2), forward * math.sin(turn / 2), turn])
+        self._motion = moved(self._motion, part)
+        self._wheels = (state.travelled, state.heading)

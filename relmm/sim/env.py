@@ -89,7 +89,7 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observe(), reward, terminated, self._steps >= self.navigation_steps and not terminated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The robot's view beside the room from above, uint8 (480, 840, 3)."""
+        """The robot's view beside the room from above, uint8 (480, 880, 3)."""
         if self.render_mode != "rgb_array":
             return None
         if self._scene is None:

@@ -17,9 +17,9 @@ from relmm.sim.body import SimBody
 from relmm.sim.renderer import Renderer, overview_camera
 
 _ROOM_SIZE = (640, 480)  # pixels
-_VIEW = 200  # pixels, side of the robot's own view, in a panel beside the room
-_INSET = 135  # pixels, side of a picture below the caption
+_VIEW = 240  # pixels, side of the robot's own view, and of a picture below it, beside the room
 SIZE = (_ROOM_SIZE[0] + _VIEW, _ROOM_SIZE[1])
+_LIGHT, _DARK = (235, 235, 235), (24, 24, 24)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -35,26 +35,32 @@ class Scene:
         self._renderer = Renderer(body.model, overview_camera(body.room.size), _ROOM_SIZE)
 
     def picture(self, caption: str = "", inset: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """The robot's view and the room now, uint8 (480, 840, 3).
+        """The robot's view and the room now, uint8 (480, 880, 3).
 
         Args:
-            caption: lines of text under the robot's view.
-            inset: a square picture under them, any size.
+            caption: lines of text over the room.
+            inset: a square picture of what the robot remembers, any size, under its view.
         """
-        panel = np.full((SIZE[1], _VIEW, 3), 24, np.uint8)
+        panel = np.full((SIZE[1], _VIEW, 3), _DARK, np.uint8)
         panel[:_VIEW] = cv2.resize(self._body.capture()[0], (_VIEW, _VIEW), interpolation=cv2.INTER_NEAREST)
-        for row, line in enumerate(caption.split("\n")):
-            place = (10, _VIEW + 26 + 22 * row)
-            cv2.putText(panel, line, place, _FONT, 0.42, (235, 235, 235), 1, cv2.LINE_AA)
+        _write(panel, "what it sees", (8, 18))
         if inset is not None:
-            left, top = (_VIEW - _INSET) // 2, SIZE[1] - _INSET - 10
-            enlarged = cv2.resize(inset, (_INSET, _INSET), interpolation=cv2.INTER_NEAREST)
-            panel[top : top + _INSET, left : left + _INSET] = enlarged
-        return np.hstack([panel, self._renderer.render(self._body.data)[0]])
+            panel[_VIEW:] = cv2.resize(inset, (_VIEW, _VIEW), interpolation=cv2.INTER_AREA)
+            _write(panel, "what it remembers", (8, _VIEW + 18))
+        room = np.ascontiguousarray(self._renderer.render(self._body.data)[0])
+        for row, line in enumerate(caption.split("\n")):
+            _write(room, line, (10, 24 + 24 * row))
+        return np.hstack([panel, room])
 
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
+
+
+def _write(picture: NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
+    """Light text with a dark edge, which can be read on anything."""
+    for color, thickness in ((_DARK, 3), (_LIGHT, 1)):
+        cv2.putText(picture, text, place, _FONT, 0.5, color, thickness, cv2.LINE_AA)
 
 
 def beside(films: Mapping[str, Path], path: Path) -> None:

@@ -50,7 +50,7 @@ def test_evaluate_films_the_arm_too(run, tmp_path):
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     seconds = json.loads((tmp_path / "out/eval_info.json").read_text())["per_episode"][0]["seconds"]
     assert len(frames) == pytest.approx(seconds / 0.2, rel=0.1), "one picture every 0.2 s of the robot's life"
-    assert frames[0].shape == (480, 840, 3)
+    assert frames[0].shape == (480, 880, 3)
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
 
 

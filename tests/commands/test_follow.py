@@ -28,7 +28,6 @@ def test_recorder_and_trainer_work_together(tmp_path):
         "--steps=60",
         "--policy.device=cpu",
         "--policy.min_attempts_to_update=4",
-        "--policy.min_steps_to_update=8",
         "--replay_frames=2000",
         "--log_freq=5",
     )
@@ -62,5 +61,5 @@ def test_recorder_and_trainer_work_together(tmp_path):
     assert (tmp_path / "record.log").read_text().count("acting by") >= 3, "new weights are picked up"
     metrics = read_metrics(run / "metrics.jsonl")
     assert metrics[-1]["steps"] >= 60
-    assert any("critic_loss" in line for line in metrics)
+    assert any("grasp_loss" in line for line in metrics)
     assert summarize(data).grasps >= metrics[-1]["attempts"]

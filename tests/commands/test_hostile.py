@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from relmm.commands import evaluate, train
+from relmm.commands import evaluate, record, train, upload
 from relmm.commands.policies import make_actor
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
@@ -21,7 +21,7 @@ WEIGHTS = "model.safetensors"
 @pytest.fixture(scope="module")
 def healthy(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("healthy")
-    config = ReLMMConfig(device="cpu", num_members=2, grasp_channels=4, navigation_hidden=8)
+    config = ReLMMConfig(device="cpu", num_members=2, channels=4)
     make_actor(config).save_pretrained(folder)
     return folder
 
@@ -102,7 +102,7 @@ DAMAGES: dict[str, tuple[Callable[[dict[str, bytes]], object], str]] = {
     "another controller": (changed_config(type="relmm_random", num_grasp=2), "No policy can be loaded"),
     "unknown setting": (changed_config(sudo=True), "sudo"),
     "setting out of range": (changed_config(num_members=0), "policy.num_members is 0"),
-    "huge networks": (changed_config(grasp_channels=1024, num_members=100), "does not fit its config"),
+    "huge networks": (changed_config(channels=1024, num_members=100), "does not fit its config"),
     "other pictures": (
         changed_config(input_features={"observation.images.front": {"type": "VISUAL", "shape": [3, 200, 200]}}),
         "expects observation.images.front of (3, 200, 200), and relmm has (3, 100, 100)",
@@ -140,6 +140,45 @@ def test_damaged_policy(tmp_path, policy, refused, damage, words):
         (tmp_path / "policy" / name).write_bytes(content)
     assert words in refused(evaluate.main, f"--policy.path={tmp_path / 'policy'}", "--eval.n_episodes=1")
     assert not Path("/tmp/relmm-was-executed").exists()
+
+
+OF_FIRST_VERSION = "is of relmm 0.1.0, whose policy relmm had other networks than this version's; use it with relmm 0.1"
+RECORDING = ("--robot.type=locobot_sim", "--dataset.repo_id=me/room", "--dataset.num_episodes=1")
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments"),
+    [
+        (evaluate.main, ["--policy.path={model}"]),
+        (record.main, ["--policy.path={model}", "--dataset.root={out}", *RECORDING]),
+        (train.main, ["--policy.path={model}", "--robot.type=locobot_sim", "--output_dir={out}"]),
+        (train.main, ["--resume=true", "--output_dir={run}"]),
+        (train.main, ["--config_path={model}/train_config.json", "--output_dir={out}"]),
+        (upload.main, ["--output_dir={run}", "--policy.repo_id=me/policy"]),
+    ],
+    ids=["eval", "record", "train from it", "resume", "its settings", "upload"],
+)
+def test_policies_of_the_first_version_are_refused(first_version, monkeypatch, capsys, tmp_path, main, arguments):
+    places = {
+        "model": first_version / "checkpoints/last/pretrained_model", "run": first_version, "out": tmp_path / "out"
+    }  # fmt: skip
+    before = sorted(first_version.rglob("*"))
+    monkeypatch.setattr(sys, "argv", ["command", *(argument.format(**places) for argument in arguments)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("relmm-")
+    assert OF_FIRST_VERSION in line
+    assert not (tmp_path / "out").exists()
+    assert sorted(first_version.rglob("*")) == before
+
+
+def test_policies_of_the_first_version_on_the_hub_are_refused(hub, first_version, refused):
+    model = first_version / "checkpoints/last/pretrained_model"
+    hub.create("me/old", files={path.name: path.read_bytes() for path in model.iterdir()})
+    assert OF_FIRST_VERSION in refused(evaluate.main, "--policy.path=me/old")
+    assert OF_FIRST_VERSION in refused(train.main, "--resume=true", "--policy.path=me/old")
 
 
 @pytest.mark.parametrize("name", ["code in a processor", "NaN", "another class"])

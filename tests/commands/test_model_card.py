@@ -9,10 +9,13 @@ from huggingface_hub import ModelCard
 from relmm.commands.model_card import ModelFacts, model_card
 from relmm.commands.train_config import TrainConfig
 from relmm.episodes import UploadedDataset
+from relmm.features import STATE_NAMES
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 
-COUNTS = {"attempts": 40, "successes": 10, "objects": 7, "pseudo_reset_steps": 120, "interventions": 3}
+COUNTS = {"attempts": 40, "successes": 10, "objects": 7, "pseudo_reset_steps": 120, "interventions": 3} | {
+    "robot_minutes": 12.3
+}
 LINES = [
     {"steps": 50, **COUNTS, "grasp_loss": 0.5},
     {
@@ -58,6 +61,7 @@ def test_results_are_those_of_the_metrics(settings, tmp_path):
     assert "One training run, of seed 5." in text
     assert "50 |" not in text.split("## Results")[1].split("## Training")[0]
     assert "40 grasp attempts of which 10 succeeded, 7 objects" in text
+    assert "in 12 minutes of the robot's time" in text
     assert "![Learning curve" in text
 
 
@@ -74,6 +78,16 @@ def test_room_camera_and_commands(settings, tmp_path):
         assert words in text
     commands = text.split("```bash")[1]
     assert commands.index("pip install") < commands.index("relmm-eval"), "the plugin first"
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"), [("relmm", "planned over the floor"), ("relmm_paper", "soft actor-critic navigates")]
+)
+def test_it_says_how_its_policy_navigates(settings, tmp_path, kind, words):
+    text = card_of(settings | {"policy": settings["policy"] | {"type": kind}}, tmp_path).text
+    assert f"A policy `{kind}` that drives" in text
+    assert words in text
+    assert f"{len(STATE_NAMES)} numbers" in text
 
 
 def test_what_is_not_there_is_not_claimed(settings, tmp_path):

@@ -20,8 +20,6 @@ from relmm.episodes.upload import recorded_runs
 from relmm.errors import HubError
 from relmm.learning.checkpoint import save_checkpoint
 from relmm.learning.hub import upload_checkpoint
-from relmm.learning.learner import Learner
-from relmm.learning.replay import Replay
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 SHARED = (
@@ -122,8 +120,8 @@ def test_a_recording_is_uploaded_when_asked(hub, call, tmp_path, monkeypatch):
 def published_run(hub, tmp_path) -> None:
     """A checkpoint, of which no weight is trained, and the sample dataset, as its own."""
     dataset = upload_dataset(SAMPLE, "me/life")
-    actor = make_actor(ReLMMConfig(device="cpu", num_members=2, grasp_channels=4, navigation_hidden=8))
-    learner = Learner(actor.policy, Replay(1000), seed=0)
+    actor = make_actor(ReLMMConfig(device="cpu", num_members=2, channels=4))
+    learner = actor.policy.make_learner(seed=0, capacity=1000)
     settings = {"policy": {"type": "relmm"}, "dataset": {"repo_id": "me/life"}}
     counters = {"episodes": 10, "interventions": 0}
     saved = save_checkpoint(tmp_path / "saved", 7, actor, learner, np.random.default_rng(0), counters, settings)
@@ -309,7 +307,7 @@ def test_going_on_on_another_machine(hub, run, tmp_path, tiny):
     relmm("train", *resume, "--policy.path=me/policy", "--output_dir=there", home="hf_there")
     no_push = ("--policy.push_to_hub=false", "--dataset.push_to_hub=false", "--hub.every=0")
     relmm("train", *resume, *no_push, "--output_dir=first")
-    for name in ("pretrained_model/model.safetensors", "training_state/navigation/optimizer_state.safetensors"):
+    for name in ("pretrained_model/model.safetensors", "training_state/grasping/optimizer_state.safetensors"):
         mine, theirs = (tmp_path / place / "checkpoints/last" / name for place in ("first", "there"))
         assert mine.read_bytes() == theirs.read_bytes()
     mine, theirs = (list(read_episodes(tmp_path / place / "dataset")) for place in ("first", "there"))

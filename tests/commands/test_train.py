@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file
 
+from relmm.commands import train as module
 from relmm.commands.train import main
 from relmm.episodes import read_episodes, summarize
 from relmm.features import Phase, Skill
@@ -52,7 +53,7 @@ def test_run_leaves_lerobots_tree(finished):
     model = {path.name for path in (last / "pretrained_model").iterdir()}
     assert {"config.json", "model.safetensors", "train_config.json", "policy_preprocessor.json"} <= model
     state = {path.name for path in (last / "training_state").iterdir()}
-    assert {"grasping", "navigation", "training_step.json", "rng_state.safetensors", "relmm_state.json"} <= state
+    assert {"grasping", "training_step.json", "rng_state.safetensors", "relmm_state.json"} <= state
 
 
 def test_dataset_holds_the_whole_life(finished):
@@ -70,6 +71,8 @@ def test_metrics_count_what_the_dataset_holds(finished):
     assert last["steps"] == 8
     assert last["attempts"] == summary.grasps
     assert last["successes"] == summary.successful_grasps
+    *_, newest = read_episodes(finished / "dataset")
+    assert last["robot_minutes"] == pytest.approx(newest.robot_times[-1] / 60, abs=1e-4)
 
 
 @pytest.mark.slow
@@ -91,6 +94,10 @@ def test_resume_goes_on_with_all_recorded_steps(tmp_path, tiny):
     drives = sum(np.count_nonzero((s == Skill.NAVIGATE) & (p == Phase.LEARNING)) for s, p in skills)
     curriculum = sum(np.count_nonzero((s == Skill.GRASP) & (p == Phase.CURRICULUM)) for s, p in skills)
     assert (drives, curriculum) == (8, 6), "steps of before count, and the curriculum is not done twice"
+    times = np.concatenate([e.robot_times for e in read_episodes(folder / "dataset")])
+    (begun,) = np.flatnonzero(np.diff(times) < 0)  # where the robot's clock began anew
+    minutes = read_metrics(folder / "metrics.jsonl")[-1]["robot_minutes"]
+    assert minutes == pytest.approx((times[begun] + times[-1]) / 60, abs=1e-3), "of both lives"
     result = train("--resume=true", f"--output_dir={folder}", "--steps=8", "--policy.device=cpu")
     assert "this run has gone 8 navigation steps already" in result.stderr + result.stdout
 
@@ -126,13 +133,14 @@ def test_killed_run_resumes(tmp_path, max_steps, tiny):
 
 BAD = {
     "curriculum": (["--curriculum.type=nonsense"], "stationary, autonomous, none"),
-    "encoder": (["--policy.navigation_encoder=eyes"], "floor, paper, paper_small"),
-    "backbone": (["--policy.grasp_backbone=dense"], "policy.grasp_backbone=rectified"),
+    "encoder": (["--policy.type=relmm_paper", "--policy.navigation_encoder=eyes"], "paper, paper_small"),
+    "gone": (["--policy.navigation_encoder=floor"], "`navigation_encoder` are not valid for ReLMMConfig"),
     "members": (["--policy.num_members=0"], "policy.num_members is 0"),
-    "rate": (["--policy.navigation_learning_rate=-1"], "policy.navigation_learning_rate is -1"),
-    "gamma": (["--policy.gamma=1.5"], "policy.gamma is 1.5"),
+    "rate": (["--policy.learning_rate=-1"], "policy.learning_rate is -1"),
+    "gamma": (["--policy.type=relmm_paper", "--policy.gamma=1.5"], "policy.gamma is 1.5"),
     "steps": (["--steps=0"], "steps is 0"),
-    "policy": (["--policy.type=relmm_random"], "--policy.type=relmm"),
+    "policy": (["--policy.type=relmm_random"], "--policy.type=relmm or relmm_paper"),
+    "another preset's policy": (["--policy.type=relmm", "--config_path=paper"], "'relmm_paper': leave one of them out"),
     "camera": (["--robot.camera=d435"], "--policy.camera=d435"),
     "unknown camera": (["--policy.camera=fisheye"], "paper, d435"),
     "room": (["--robot.room=attic"], "no_obstacles"),
@@ -168,7 +176,7 @@ def test_bad_settings_end_in_one_sentence(tmp_path, refused, arguments, words, t
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("preset", ["fast", "paper", "paper_small"])
+@pytest.mark.parametrize("preset", ["paper", "paper_small"])
 def test_preset_and_checkpoint_together_are_refused(tmp_path, refused, tiny, preset):
     """Which of the two policies was meant?"""
     both = (f"--config_path={preset}", "--policy.path=me/cleaner")
@@ -176,9 +184,37 @@ def test_preset_and_checkpoint_together_are_refused(tmp_path, refused, tiny, pre
     assert "leave one of them out" in refused(*kept, *both, f"--output_dir={tmp_path / 'run'}")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "kind"),
+    [
+        ([], "relmm"),
+        (["--policy.type=relmm_paper"], "relmm_paper"),
+        (["--config_path=paper"], "relmm_paper"),
+        (["--config_path=paper_small", "--policy.grasp_channels=4"], "relmm_paper"),
+        (["--config_path=paper_small", "--policy.type=relmm_paper"], "relmm_paper"),
+        (["--config_path={folder}/room.yaml"], "relmm"),
+        (["--config_path={folder}/room.yaml", "--policy.type=relmm_paper"], "relmm_paper"),
+        (["--config_path={folder}/paper.json"], "relmm_paper"),
+    ],
+)
+def test_policy_is_the_one_that_anything_names_or_the_default(tmp_path, monkeypatch, arguments, kind):
+    (tmp_path / "room.yaml").write_text("robot:\n  type: locobot_sim\nsteps: 9\n")
+    (tmp_path / "paper.json").write_text('{"policy": {"type": "relmm_paper", "num_members": 2}}')
+    given = [argument.format(folder=tmp_path) for argument in arguments]
+    configs = []
+    monkeypatch.setattr(module, "train", configs.append)
+    robot = ["--robot.type=locobot_sim", "--policy.device=cpu", "--policy.num_stationary=6"]
+    monkeypatch.setattr(sys, "argv", ["relmm-train", *robot, *given, f"--output_dir={tmp_path / 'run'}"])
+    main()
+    (config,) = configs
+    assert config.policy.type == kind
+    assert config.policy.num_stationary == 6
+    assert config.steps == (9 if "room" in "".join(given) else 2000)
+
+
 def test_config_path_that_is_neither_file_nor_preset_is_refused(tmp_path, refused, tiny):
     words = refused(*tiny, "--config_path=nonsense", f"--output_dir={tmp_path / 'run'}")
-    assert "--config_path=nonsense: there is no such file; choose one, or a preset: fast, paper, paper_small." in words
+    assert "--config_path=nonsense: there is no such file; choose one, or a preset: paper, paper_small." in words
 
 
 def test_no_run_to_resume_is_said_before_what_it_would_have_known(tmp_path, refused):

@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from relmm.episodes import DurableDataset, Episode, FrameBuilder
-from relmm.features import DEPTH_KEY, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phase, Skill, action_dict
+from relmm.features import (
+    BELIEF,
+    DEPTH_KEY,
+    IMAGE_KEY,
+    ODOMETRY,
+    STATE_KEY,
+    STATE_NAMES,
+    Phase,
+    Skill,
+    action_dict,
+)
 
 REPO_ID = "tester/clean_room"
 INFO = {"room": "no_obstacles", "camera": "paper", "seed": 3}
@@ -39,14 +49,14 @@ def action(episode: int, step: int) -> dict:
 
 
 def outcome(episode: int, step: int, length: int) -> dict:
-    end = step == length - 1
+    end, explained = step == length - 1, enumerate((*BELIEF, *ODOMETRY))
     return {
         "next.reward": float(step % 6 == 1) * (1 + episode),
         "next.done": end and episode % 2 == 0,
         "next.truncated": end and episode % 2 == 1,
         "next.success": end and episode % 2 == 0,
         "complementary_info.phase": int(Phase(step % 4)),
-        "complementary_info.grasp_probability": episode % 16 / 16 + step / 1024,
+        **{f"complementary_info.{name}": episode % 16 / 16 + step / 1024 + i for i, name in explained},
         "complementary_info.robot_time": 100 * episode + 0.5 * step,
     }
 

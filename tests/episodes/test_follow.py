@@ -245,12 +245,41 @@ def test_deleted_episodes(tmp_path):
         check_episode(episodes[number], number, source)
 
 
+def test_every_edit_keeps_the_camera(tmp_path):
+    """LeRobot leaves `meta/relmm.json` behind."""
+    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, remove_feature, split_dataset
+
+    new_dataset(tmp_path / "d", 4, depth=True)
+    whole = load(tmp_path / "d")
+    delete_episodes(whole, [1], output_dir=tmp_path / "deleted", repo_id="tester/deleted")
+    remove_feature(whole, "next.success", output_dir=tmp_path / "removed", repo_id="tester/removed")
+    parts = split_dataset(whole, {"train": 0.5, "test": 0.5}, output_dir=tmp_path)
+    merge_datasets(list(parts.values()), REPO_ID, output_dir=tmp_path / "merged")
+    for name in ("deleted", "removed", "train", "test", "merged"):
+        assert not (tmp_path / name / "meta/relmm.json").exists()
+        assert len(list(read_episodes(tmp_path / name, camera="paper"))) == load(tmp_path / name).num_episodes
+        with pytest.raises(DatasetError, match=r"the camera paper \(.*the policy's is d435 \("):
+            read_episodes(tmp_path / name, camera="d435")
+    with pytest.raises(DatasetError, match=r"camera: have paper \(.*, want d435 \("):
+        DurableDataset.open(tmp_path / "merged", REPO_ID, info={"camera": "d435"})
+
+
+def test_lerobot_merges_no_two_cameras(tmp_path):
+    from lerobot.datasets.dataset_tools import merge_datasets
+
+    for camera in ("paper", "d435"):
+        with DurableDataset.create(REPO_ID, tmp_path / camera, False, "locobot_sim", {"camera": camera}) as dataset:
+            record(dataset, range(1))
+    with pytest.raises(ValueError, match="Same features"):
+        merge_datasets([load(tmp_path / name) for name in ("paper", "d435")], REPO_ID, output_dir=tmp_path / "both")
+
+
 def test_several_episodes_in_a_file_and_then_more(tmp_path):
     from lerobot.datasets.dataset_tools import merge_datasets
 
     root = tmp_path / "merged"
     new_dataset(tmp_path / "a", 3)
-    with DurableDataset.create(REPO_ID, tmp_path / "b", False, "locobot_sim") as dataset:
+    with DurableDataset.create(REPO_ID, tmp_path / "b", False, "locobot_sim", INFO) as dataset:
         record(dataset, range(6, 9))
     merge_datasets([load(tmp_path / name) for name in "ab"], REPO_ID, output_dir=root)
     assert len(list(root.glob("data/*/*.parquet"))) == 1

@@ -9,11 +9,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from episode_helpers import DATA, check_episode, check_episodes, new_dataset
+from episode_helpers import DATA, INFO, REPO_ID, check_episode, check_episodes, new_dataset
 
-from relmm.episodes import EpisodeFollower, check_trainable, read_episodes
+from relmm.episodes import DurableDataset, EpisodeFollower, check_trainable, read_episodes
 from relmm.errors import DatasetError
-from relmm.features import IMAGE_KEY
+from relmm.features import IMAGE_KEY, STATE_KEY
 
 
 def edit_info(root, change):
@@ -51,12 +51,79 @@ def test_other_datasets_are_refused_before_anything_is_read(tmp_path, change, wo
         assert "; choose " in str(caught.value)
 
 
-def test_another_dataset_is_refused_when_it_comes(tmp_path):
-    follower = EpisodeFollower(tmp_path / "d")
+def as_recorded_by_0_1_0(info):
+    joints = ["waist.pos", "shoulder.pos", "elbow.pos", "wrist_angle.pos", "wrist_rotate.pos"]
+    names = ["x.vel", "theta.vel", *joints, "gripper.pos", "holding.pos", "bumper.pos"]
+    info["features"][STATE_KEY].update(shape=[10], names=names)
+    for name in ("grasp_mean", "grasp_std", "odom_x", "odom_y", "odom_heading"):
+        del info["features"][f"complementary_info.{name}"]
+
+
+def test_datasets_of_the_old_schema_are_refused_with_what_reads_them(tmp_path):
     new_dataset(tmp_path / "d", 1)
+    edit_info(tmp_path / "d", as_recorded_by_0_1_0)
+    resume = lambda root: DurableDataset.open(root, REPO_ID, info=INFO)  # noqa: E731
+    for read in (check_trainable, read_episodes, EpisodeFollower, resume):
+        with pytest.raises(DatasetError) as caught:
+            read(tmp_path / "d")
+        assert str(caught.value) == (
+            f"{tmp_path / 'd'} was recorded by relmm 0.1.0, its observation.state has no y.vel and no scan_00.pos to "
+            "scan_40.pos; choose a newer dataset, or read it with relmm 0.1.0."
+        )
+
+
+# --- Cameras -------------------------------------------------------------------------------------------------
+READERS = (
+    check_trainable,
+    lambda root, camera: read_episodes(root, camera=camera),
+    lambda root, camera: EpisodeFollower(root, camera=camera),
+)
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_a_dataset_of_another_camera_is_refused_with_both(tmp_path, read):
+    new_dataset(tmp_path / "d", 1)
+    for camera in ("paper", None):
+        read(tmp_path / "d", camera)
+    with pytest.raises(DatasetError) as caught:
+        read(tmp_path / "d", "d435")
+    assert str(caught.value) == (
+        f"{tmp_path / 'd'} was recorded with the camera paper (position [0.067, 0.0, 0.591], pitch 42.1, fov "
+        "[60.0, 60.0]), but the policy's is d435 (position [0.0844, 0.0175, 0.4626], pitch 47.27, fov [57.0, 44.3]); "
+        "choose another dataset, or set --policy.camera to the dataset's."
+    )
+
+
+def test_a_camera_of_the_same_name_that_looks_elsewhere_is_refused(tmp_path):
+    new_dataset(tmp_path / "d", 1)
+    edit_info(tmp_path / "d", lambda info: info["features"][IMAGE_KEY]["info"]["camera"].update(pitch=40.0))
+    with pytest.raises(DatasetError, match=r"paper \(.*pitch 40\.0.*paper \(.*pitch 42\.1"):
+        check_trainable(tmp_path / "d", "paper")
+
+
+@pytest.mark.parametrize("info", [None, {}, {"is_depth_map": False}, {"camera": None}, [1], "?"])
+def test_a_dataset_that_does_not_tell_its_camera_may_have_any(tmp_path, info):
+    new_dataset(tmp_path / "d", 1)
+    edit_info(tmp_path / "d", lambda whole: whole["features"][IMAGE_KEY].update(info=info))
+    for camera in ("paper", "d435"):
+        check_episodes(read_episodes(tmp_path / "d", camera=camera), [0])
+
+
+def test_a_description_of_a_camera_that_is_none_is_no_crash(tmp_path):
+    new_dataset(tmp_path / "d", 1)
+    edit_info(tmp_path / "d", lambda info: info["features"][IMAGE_KEY]["info"].update(camera="webcam"))
+    with pytest.raises(DatasetError, match="recorded with the camera 'webcam', but the policy's is paper"):
+        check_trainable(tmp_path / "d", "paper")
+
+
+def test_another_dataset_is_refused_when_it_comes(tmp_path):
+    followers = [EpisodeFollower(tmp_path / "d", camera=camera) for camera in (None, "d435")]
+    new_dataset(tmp_path / "d", 1)
+    with pytest.raises(DatasetError, match="recorded with the camera paper"):
+        followers[1].poll()
     edit_info(tmp_path / "d", lambda info: info.update(fps=30))
     with pytest.raises(DatasetError, match="fps: have 30"):
-        follower.poll()
+        followers[0].poll()
 
 
 def test_more_columns_are_welcome(tmp_path):

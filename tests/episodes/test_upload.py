@@ -251,6 +251,7 @@ def test_the_card_says_what_is_in_it(tmp_path, hub):
     assert re.search(r"\| 0 \| no_obstacles \| paper \| 3 \|", card.text)
     assert set(dataset_features(True)) <= set(DATASET_COLUMNS)
     assert all(f"| `{key}` |" in card.text for key in dataset_features(True))
+    assert card.text.count("camera paper (position [0.067, 0.0, 0.591], pitch 42.1, fov [60.0, 60.0])") == 2
     assert hub.repo(NAME, "datasets").files["contact_sheet.png"].startswith(b"\x89PNG")
 
 

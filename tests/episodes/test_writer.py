@@ -21,13 +21,14 @@ from episode_helpers import (
 
 from relmm.episodes import DurableDataset, FrameBuilder
 from relmm.errors import ConfigError, DatasetError
-from relmm.features import FPS, IMAGE_KEY, dataset_features
+from relmm.features import DEPTH_KEY, FPS, IMAGE_KEY, dataset_features
+from relmm.geometry import camera_info
 
 
 def record_with_stock_lerobot(root, episodes, depth=False):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    features = dataset_features(depth)
+    features = dataset_features(depth, camera_info("paper"))
     dataset = LeRobotDataset.create(
         REPO_ID, FPS, features, root=root, robot_type="locobot_sim", use_videos=False, video_backend="pyav"
     )
@@ -37,6 +38,10 @@ def record_with_stock_lerobot(root, episodes, depth=False):
             dataset.add_frame({**build(*arguments(episode, step, depth)), "task": TASK})
         dataset.save_episode()
     dataset.finalize()
+
+
+def load_info(root):
+    return json.loads((root / "meta/info.json").read_text())
 
 
 def test_every_frame_comes_back_through_lerobot(tmp_path):
@@ -134,9 +139,42 @@ def test_a_discarded_episode_leaves_nothing(tmp_path):
 
 def test_a_dataset_without_episodes_can_be_continued(tmp_path):
     new_dataset(tmp_path / "d", 0)
+    began = load_info(tmp_path / "d")["features"]
     with DurableDataset.open(tmp_path / "d", REPO_ID) as dataset:
         record(dataset, range(2))
     check_dataset(tmp_path / "d", 2)
+    assert load_info(tmp_path / "d")["features"] == began
+
+
+@pytest.mark.parametrize("camera", ["paper", "d435"])
+def test_pictures_know_their_camera(tmp_path, camera):
+    DurableDataset.create(REPO_ID, tmp_path / "d", True, "locobot_sim", {"camera": camera}).close()
+    features = load_info(tmp_path / "d")["features"]
+    assert features[IMAGE_KEY]["info"] == {"is_depth_map": False, "camera": camera_info(camera)}
+    assert features[DEPTH_KEY]["info"] == {"is_depth_map": True, "depth_unit": "mm", "camera": camera_info(camera)}
+
+
+def test_a_camera_nobody_knows_is_refused_and_none_is_written_where_none_is_known(tmp_path):
+    with pytest.raises(ConfigError, match="Unknown camera 'fisheye'"):
+        DurableDataset.create(REPO_ID, tmp_path / "d", False, "locobot_sim", {"camera": "fisheye"})
+    assert not (tmp_path / "d").exists()
+    DurableDataset.create(REPO_ID, tmp_path / "d", False, "locobot_sim").close()
+    assert load_info(tmp_path / "d")["features"][IMAGE_KEY]["info"] == {"is_depth_map": False}
+    with DurableDataset.open(tmp_path / "d", REPO_ID, info={"camera": "d435"}) as dataset:
+        record(dataset, range(1))
+    check_dataset(tmp_path / "d", 1)
+
+
+def test_resuming_and_repairing_keep_the_camera(tmp_path):
+    new_dataset(tmp_path / "d", 1, depth=True)
+    before = load_info(tmp_path / "d")["features"]
+    for damage in (False, True):
+        if damage:
+            (tmp_path / "d/meta/info.json").unlink()
+        with pytest.raises(DatasetError, match="camera: have paper"):
+            DurableDataset.open(tmp_path / "d", REPO_ID, info={"camera": "d435"})
+        DurableDataset.open(tmp_path / "d", REPO_ID, info=INFO).close()
+        assert load_info(tmp_path / "d")["features"] == before
 
 
 def test_files_go_on_in_the_next_chunk(tmp_path):
@@ -191,7 +229,7 @@ def snapshot(root):
     ("settings", "words"),
     [
         ({"robot_type": "locobot"}, "robot type: have locobot_sim, want locobot"),
-        ({"info": {"camera": "d435"}}, "camera: have paper, want d435"),
+        ({"info": {"camera": "d435"}}, r"camera: have paper \(.*\), want d435 \("),
         ({"depth": True}, "front_depth: have no such column, want image"),
     ],
 )

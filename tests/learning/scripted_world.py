@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import torch
 
 from relmm.features import FRONT, STATE_NAMES, Phase, Skill, action_dict
 from relmm.learning.life import Life
-from relmm.policies.relmm.configuration_relmm import ReLMMConfig
-from relmm.policies.relmm.searching import Search
+from relmm.policies.controller import Row, grasp_cell
+from relmm.policies.learning import LearningConfig
 
-SAMPLED_CELL = 99  # that the ensemble would choose
-POLICY_DRIVE = action_dict(x_vel=0.123, theta_vel=45.6)  # that the navigation would choose
+CELL = 99  # that the policy always chooses
+DRIVE_BEFORE, DRIVE_AFTER = 2, 3  # of a pseudo-reset, around the placement
 
 Event = tuple[str, Phase | None]
 LEARN_GRASP, LEARN_DRIVE = ("learn to grasp", None), ("learn to drive", None)
@@ -25,7 +24,7 @@ LEARN_GRASP, LEARN_DRIVE = ("learn to grasp", None), ("learn to drive", None)
 class World:
     """A robot whose grasps succeed, and whose pictures ask for a grasp, by chance; and what happened to it.
 
-    `grasp_wanted` is what P[grasp] of the next pictures is: it changes with every drive.
+    `grasp_wanted` is what the gate says of the next pictures: it changes with every drive.
     """
 
     seed: int
@@ -36,6 +35,7 @@ class World:
     grasps: list[bool] = field(default_factory=list)  # whether each succeeded
     holding: bool = False
     stuck: bool = False  # whether nothing can be put down: something is in the way
+    looks: int = 0  # observations so far
 
     def __post_init__(self) -> None:
         self._successes, self._wishes = (np.random.default_rng([self.seed, which]) for which in (0, 1))
@@ -63,8 +63,10 @@ class World:
     phase = Phase.LEARNING  # of the action to come
 
     def get_observation(self) -> dict[str, Any]:
-        picture = np.full((2, 2, 3), 255 * self.grasp_wanted, np.uint8)
-        return {**dict.fromkeys(STATE_NAMES, 0.5), "holding.pos": float(self.holding), FRONT: picture}
+        """Its picture tells its number, and whether a grasp is wanted."""
+        self.looks += 1
+        picture = np.array([*divmod(self.looks, 256), self.grasp_wanted], np.uint8).reshape(1, 1, 3)
+        return {**dict.fromkeys(STATE_NAMES, 0.0), "holding.pos": float(self.holding), FRONT: picture}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         self.actions.append(action)
@@ -76,56 +78,63 @@ class World:
 class PhaseLife(Life):
     """A life that tells the world the phase of each frame."""
 
-    def step(self, action: dict[str, float], phase: Phase, grasp_probability: float = -1.0) -> bool:
+    def step(self, action: dict[str, float], phase: Phase, belief: Any = None) -> bool:
         self._robot.phase = phase
-        return super().step(action, phase, grasp_probability)
+        return super().step(action, phase, belief)
 
 
-class FakePolicy:
-    """Its P[grasp] is what the picture says: 1 if it is white, `floor_probability` if black."""
+def number_of(picture: np.ndarray) -> int:
+    """Of an observation."""
+    return 256 * int(picture[0, 0, 0]) + int(picture[0, 0, 1])
+
+
+class ScriptedPolicy:
+    """Wants to grasp where the picture says so, `num_grasp` times at most; its belief tells which picture it saw."""
 
     sampling = False
-    rng = None
-    floor_probability = 0.0
 
-    def __init__(self, config: ReLMMConfig) -> None:
+    def __init__(self, config: LearningConfig) -> None:
         self.config = config
-        self.grasp_probability = -1.0
-        self.grasping = SimpleNamespace(sample=lambda estimate, rng: torch.tensor([SAMPLED_CELL]))
+        self.observed: list[int] = []  # numbers of the pictures, in order
+        self._wanted = False
 
-    def to_pictures(self, image: np.ndarray) -> np.ndarray:
-        return image
+    def observe(self, image: np.ndarray, state: np.ndarray, row: Row) -> None:
+        self.observed.append(number_of(image))
+        self._wanted = bool(image[0, 0, 2])
+        row.belief = {"grasp_probability": number_of(image) / 1024}
 
-    def look(self, image: np.ndarray) -> None:
-        self.grasp_probability = 1.0 if image.max() else self.floor_probability
+    def decide(self, image: np.ndarray, state: np.ndarray, row: Row) -> dict[str, float]:
+        assert number_of(image) == self.observed[-1], "it decides on what it has observed last"
+        wants = row.attempts < self.config.num_grasp and self._wanted
+        return self.attempt(row) if wants else self.navigate(row)
 
-    def navigate(self, image: np.ndarray, theta_vel: float, search: Search, rng: object) -> dict[str, float]:
-        return POLICY_DRIVE
+    def attempt(self, row: Row) -> dict[str, float]:
+        row.belief |= {"grasp_mean": 0.75}
+        return grasp_cell(CELL)
+
+    def navigate(self, row: Row) -> dict[str, float]:
+        return action_dict(x_vel=0.125, theta_vel=45.0)
+
+    def pseudo_reset(self, row: Row, steps: int, holding: Callable[[], bool]) -> Iterator[dict[str, float]]:
+        for _ in range(DRIVE_BEFORE * steps):
+            yield action_dict(x_vel=0.25)
+        if holding():
+            yield action_dict(Skill.PLACE, x=0.33)
+        for _ in range(DRIVE_AFTER * steps):
+            yield action_dict(x_vel=0.25)
 
 
-class FakeReplay:
-    """Holds the world's attempts."""
+class ScriptedLearner:
+    """Notes when it is asked to learn, and what frames it was given."""
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self.attempts = world.grasps
+        self.phases: list[int] = []  # of the attempts that it was asked to learn from
+        self.outcomes: list[dict[str, Any]] = []
 
     @property
     def attempts_since_first_success(self) -> int:
         return self._world.attempts_since_first_success
-
-
-class FakeLearner:
-    """Notes when it is asked to learn."""
-
-    def __init__(self, world: World, min_attempts: int) -> None:
-        self._world, self._min_attempts = world, min_attempts
-        self.phases: list[int] = []  # of the attempts that it was asked to learn from
-        self.replay = FakeReplay(world)
-
-    @property
-    def grasping_has_begun(self) -> bool:
-        return len(self.replay.attempts) >= self._min_attempts
 
     def update_grasping(self, phase: int) -> None:
         self.phases.append(phase)
@@ -135,8 +144,8 @@ class FakeLearner:
         self._world.events.append(LEARN_DRIVE)
 
     # --- As a recorder --------------------------------------------------------------------------------------
-    def add_frame(self, observation: Any, action: dict[str, float], outcome: Any, task: str) -> None:
-        pass
+    def add_frame(self, observation: Any, action: dict[str, float], outcome: dict[str, Any], task: str) -> None:
+        self.outcomes.append({**outcome, "number": number_of(observation[FRONT])})
 
     def save_episode(self) -> None:
         pass

@@ -9,6 +9,8 @@ import pytest
 
 from relmm.commands.policies import make_actor
 from relmm.features import FREE_GRASPS, Phase, Skill
+from relmm.geometry import moved
+from relmm.learning.actor import Actor
 from relmm.learning.collect import Collector
 from relmm.learning.life import Life
 from relmm.policies.random.configuration_random import RelmmRandomConfig
@@ -112,3 +114,26 @@ def test_stopping_cuts_the_episode_off_after_the_frame(robot, stop_after):
     result = loop.episode()
     assert result.frames == stop_after
     assert recorder.episodes[0][-1][2]["next.truncated"]
+
+
+def test_what_the_policy_believed_is_recorded_where_it_acted(robot, monkeypatch):
+    loop, recorder = collector(robot, RelmmScriptedConfig(device="cpu"), max_steps=250)
+    assert loop.episode().success
+    monkeypatch.setattr(Actor, "belief", property(lambda actor: {"grasp_mean": 0.5}))
+    loop.episode()
+    column = "complementary_info.grasp_mean"
+    assert {outcome[column] for _, _, outcome, _ in recorder.episodes[0]} == {-1.0}
+    beliefs = {(outcome["complementary_info.phase"], outcome[column]) for _, _, outcome, _ in recorder.episodes[1]}
+    assert beliefs == {(Phase.PSEUDO_RESET, 0.5), (Phase.LEARNING, 0.5)}
+
+
+def test_odometry_leads_to_where_the_robot_is(robot):
+    loop, recorder = collector(robot, RelmmScriptedConfig(device="cpu"), max_steps=250)
+    start = np.array(robot.body.truth.robot())
+    loop.episode()
+    loop.episode()
+    assert len(recorder.episodes[0]) + len(recorder.episodes[1]) > 20
+    x, y, heading = robot.body.truth.robot()
+    pose = moved(start, loop._life.pose)
+    assert pose[:2] == pytest.approx((x, y), abs=0.06)
+    assert np.cos(pose[2] - heading) > np.cos(np.radians(8))

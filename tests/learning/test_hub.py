@@ -12,18 +12,16 @@ from relmm.episodes import UploadedDataset
 from relmm.errors import ConfigError, HubError
 from relmm.learning.checkpoint import install_checkpoint, last_checkpoint, load_training_state, save_checkpoint
 from relmm.learning.hub import fetch_checkpoint, fetch_policy, upload_checkpoint
-from relmm.learning.learner import Learner
 from relmm.learning.progress import Progress
-from relmm.learning.replay import Replay
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 NAME = "me/policy"
 RUNS = [{"first_episode": 0, "seed": 1}]
 DATASET = UploadedDataset("me/life", "a" * 40, 3)
 STATE = "training_state/relmm_state.json"
-ADAM = "training_state/navigation/optimizer_state.safetensors"
+ADAM = "training_state/grasping/optimizer_state.safetensors"
 SETTINGS = {
-    "policy": {"type": "relmm", "push_to_hub": True, "repo_id": "me/policy", "gamma": 0.9},
+    "policy": {"type": "relmm", "push_to_hub": True, "repo_id": "me/policy", "updates": 3},
     "dataset": {"repo_id": "me/life", "root": "/home/me/secret", "push_to_hub": True},
     "hub": {"every": 100},
     "output_dir": "/home/me/runs/first",
@@ -31,8 +29,8 @@ SETTINGS = {
 
 
 def small_learner() -> tuple:
-    actor = make_actor(ReLMMConfig(device="cpu", num_members=2, grasp_channels=4, navigation_hidden=8))
-    learner = Learner(actor.policy, Replay(1000), seed=0)
+    actor = make_actor(ReLMMConfig(device="cpu", num_members=2, channels=4))
+    learner = actor.policy.make_learner(seed=0, capacity=1000)
     for optimizer in learner.optimizers.values():  # a step, so that there is a state
         for group in optimizer.param_groups:
             for weight in group["params"]:
@@ -86,7 +84,7 @@ def test_what_belongs_to_one_machine_stays_there(hub, save_step):
     push(save_step(7))
     settings = json.loads(hub.repo(NAME).files["train_config.json"])
     assert "/home/me" not in json.dumps(settings)
-    assert settings["policy"] | {"gamma": 0.9} == settings["policy"]
+    assert settings["policy"]["updates"] == 3
     assert (settings["policy"]["push_to_hub"], settings["policy"]["repo_id"]) == (False, None)
     assert (settings["dataset"]["push_to_hub"], settings["hub"]) == (False, {})
 
@@ -173,7 +171,7 @@ def test_damaged_training_state(save_step, name, damage, words):
         path.write_bytes(damage(path.read_bytes()))
     _, learner = small_learner()
     with pytest.raises(ConfigError, match=words) as caught:
-        load_training_state(path.parents[2 if "navigation" in name else 1], learner, np.random.default_rng())
+        load_training_state(path.parents[2 if "grasping" in name else 1], learner, np.random.default_rng())
     assert "\n" not in str(caught.value)
 
 

@@ -1,11 +1,33 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
-from relmm.features import Phase, Skill, action_dict
+from relmm.features import ACTION_NAMES, Phase, Skill, action_dict
 from relmm.learning.progress import Metrics, Progress, read_metrics
+
+Frame = tuple[Skill, bool, Phase, float]  # the last is s on the robot's clock
+
+
+def live(progress: Progress, *frames: Frame) -> Progress:
+    """Count frames as they happen."""
+    for skill, success, phase, time in frames:
+        outcome = {"next.reward": float(success), "complementary_info.phase": int(phase)}
+        progress.add_frame({}, action_dict(skill), outcome | {"complementary_info.robot_time": time}, "task")
+    progress.save_episode()
+    return progress
+
+
+def recorded(*frames: Frame) -> Any:
+    """The columns of an episode."""
+    skills, rewards, phases, times = (np.array(column) for column in zip(*frames, strict=True))
+    actions = np.zeros((len(frames), len(ACTION_NAMES)), np.float32)
+    actions[:, ACTION_NAMES.index("skill.pos")] = skills
+    return SimpleNamespace(actions=actions, rewards=rewards.astype(np.float32), phases=phases, robot_times=times)
 
 
 @pytest.mark.parametrize(
@@ -23,21 +45,31 @@ from relmm.learning.progress import Metrics, Progress, read_metrics
     ],
 )
 def test_each_frame_counts_as_what_it_is(skill: Skill, success: bool, phase: Phase, counts: dict[str, int]) -> None:
-    progress, recorder = Progress(), Progress()
-    progress.add(float(skill), success, int(phase))
-    outcome = {"next.reward": float(success), "complementary_info.phase": int(phase)}
-    recorder.add_frame({}, action_dict(skill), outcome, "task")
-    assert progress == recorder == Progress(**counts)
+    frame = (skill, success, phase, 0.0)
+    read = Progress()
+    read.read(recorded(frame))
+    assert live(Progress(), frame) == read == Progress(**counts)
 
 
 def test_counts_add_up() -> None:
     progress = Progress(interventions=2)
-    for _ in range(3):
-        progress.add(Skill.NAVIGATE, False, Phase.LEARNING)
-        progress.add(Skill.GRASP, True, Phase.LEARNING)
-        progress.save_episode()
-    wanted = {"steps": 3, "attempts": 3, "successes": 3, "objects": 3, "interventions": 2}
+    for index in range(3):
+        drive, grasp = (Skill.NAVIGATE, False, Phase.LEARNING), (Skill.GRASP, True, Phase.LEARNING)
+        live(progress, (*drive, 40.0 * index), (*grasp, 40.0 * index + 10))
+    wanted = {"steps": 3, "attempts": 3, "successes": 3, "objects": 3, "interventions": 2, "robot_minutes": 1.5}
     assert progress.asdict() == {"practice_attempts": 0, "pseudo_reset_steps": 0, **wanted}
+
+
+def test_the_robots_minutes_add_up_over_its_lives() -> None:
+    """Its clock begins anew when it is connected again; the run counts the frames of its dataset, then goes on."""
+    drive = (Skill.NAVIGATE, False, Phase.LEARNING)
+    progress = Progress()
+    progress.read(recorded((*drive, 6.0), (*drive, 60.0)))
+    progress.read(recorded((*drive, 90.0)))
+    assert progress.robot_minutes == pytest.approx(1.5)
+    assert live(progress, (*drive, 1.2), (*drive, 30.0)).robot_minutes == pytest.approx(2.0)
+    progress.read(recorded((*drive, 60.0)))
+    assert progress.robot_minutes == pytest.approx(2.5)
 
 
 def test_metrics_are_read_as_written_and_appended_to(tmp_path: Path) -> None:

@@ -9,23 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 from scripted_world import (
+    CELL,
+    DRIVE_AFTER,
+    DRIVE_BEFORE,
     LEARN_DRIVE,
     LEARN_GRASP,
-    POLICY_DRIVE,
-    SAMPLED_CELL,
-    FakeLearner,
-    FakePolicy,
     PhaseLife,
+    ScriptedLearner,
+    ScriptedPolicy,
     World,
 )
 
-from relmm.features import GRID, Phase, Skill, in_grasp_area, xy_to_cell
+from relmm.features import Phase, Skill, in_grasp_area, xy_to_cell
 from relmm.learning.progress import Progress
 from relmm.learning.trainer import Trainer
-from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.learning import LearningConfig
+from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
 PSEUDO_RESET_STEPS = 3
-TURN_ROUND_STEPS, TURN_AWAY_STEPS = 6, 4  # of a pseudo-reset, before and after the placement
 DRIVE, GRASP, DROP = (("drive", Phase.LEARNING), ("grasp", Phase.LEARNING), ("place", Phase.CURRICULUM))
 PRACTICE = ("grasp", Phase.CURRICULUM)
 
@@ -35,7 +36,8 @@ class Run:
     world: World
     trainer: Trainer
     progress: Progress
-    policy: FakePolicy
+    policy: ScriptedPolicy
+    learner: ScriptedLearner
 
 
 MakeRun = Callable[..., Run]
@@ -50,15 +52,14 @@ def make_run() -> MakeRun:
         should_stop: Callable[[], bool] = lambda: False,
         **settings: Any,
     ) -> Run:
-        config = ReLMMConfig(**{"device": "cpu", "random_steps": 0, **settings})
-        progress, policy = Progress(), FakePolicy(config)
-        learner = FakeLearner(world, config.min_attempts_to_update)
+        policy = ScriptedPolicy(RelmmPaperConfig(device="cpu", **settings))
+        progress, learner = Progress(), ScriptedLearner(world)
         life = PhaseLife(world, [learner, progress], lambda: 0.0, max_steps=10**6, should_stop=should_stop)
         trainer = Trainer(
             life, policy, learner, curriculum=curriculum, pseudo_reset_steps=PSEUDO_RESET_STEPS,
             rng=np.random.default_rng(0), put_in_reach=put_in_reach, progress=progress,
         )  # fmt: skip
-        return Run(world, trainer, progress, policy)
+        return Run(world, trainer, progress, policy, learner)
 
     return make
 
@@ -77,10 +78,8 @@ def train_grasp(world: World, n: int, st: bool, phase: Phase) -> bool:
     return False
 
 
-def train_grasp_auto_curr(world: World, config: ReLMMConfig) -> bool:
-    """Algorithm 3; attempts count from the first success on, as in the authors' code."""
-    if world.attempts_since_first_success >= config.num_max:
-        return train_grasp(world, config.num_grasp, False, Phase.LEARNING)
+def train_grasp_auto_curr(world: World, config: LearningConfig) -> bool:
+    """Algorithm 3 from its fifth line on; attempts count from the first success on, as in the authors' code."""
     n_since, r_max = 0, False
     while True:
         r_g = world.grasp(Phase.CURRICULUM)
@@ -100,28 +99,26 @@ def train_grasp_auto_curr(world: World, config: ReLMMConfig) -> bool:
 
 
 def pseudo_reset(world: World) -> None:
-    """Section 4.3: carry it elsewhere, turn round, put it down, turn and drive away."""
-    for _ in range(PSEUDO_RESET_STEPS + TURN_ROUND_STEPS):
+    """The scripted policy's."""
+    for _ in range(DRIVE_BEFORE * PSEUDO_RESET_STEPS):
         world.drive(Phase.PSEUDO_RESET)
     if world.holding:
         world.place(Phase.PSEUDO_RESET)
-    for _ in range(TURN_AWAY_STEPS + PSEUDO_RESET_STEPS):
+    for _ in range(DRIVE_AFTER * PSEUDO_RESET_STEPS):
         world.drive(Phase.PSEUDO_RESET)
 
 
-def relmm_step(world: World, config: ReLMMConfig, autonomous: bool) -> None:
-    """The loop of Algorithms 2 and 4; P[grasp] is 1 while the curriculum lasts, and that of the picture after a_n."""
-    practising = autonomous and world.attempts_since_first_success < config.num_max
-    world.drive(Phase.LEARNING)
+def relmm_step(world: World, config: LearningConfig, autonomous: bool = False) -> None:
+    """The loop of Algorithms 2 and 4 from the gate on, so that a turn ends with a_n; P[grasp] is 1 while practising."""
     r_g = False
-    if practising or world.grasp_wanted:
-        if autonomous:
-            r_g = train_grasp_auto_curr(world, config)
-        else:
-            r_g = train_grasp(world, config.num_grasp, False, Phase.LEARNING)
-    world.events.append(LEARN_DRIVE)
+    if autonomous and world.attempts_since_first_success < config.num_max:
+        r_g = train_grasp_auto_curr(world, config)
+    elif world.grasp_wanted:
+        r_g = train_grasp(world, config.num_grasp, False, Phase.LEARNING)
     if r_g:
         pseudo_reset(world)
+    world.drive(Phase.LEARNING)
+    world.events.append(LEARN_DRIVE)
 
 
 # --- Normal training -----------------------------------------------------------------------------------------
@@ -131,7 +128,7 @@ def test_training_is_algorithm_2(num_grasp: int, seed: int, make_run: MakeRun) -
     run, paper = make_run(World(seed), num_grasp=num_grasp), World(seed)
     for _ in range(60):
         run.trainer.navigation_step()
-        relmm_step(paper, run.policy.config, autonomous=False)
+        relmm_step(paper, run.policy.config)
     assert run.world.events == paper.events
     assert run.progress.steps == 60
     assert run.policy.sampling, "it explores"
@@ -148,55 +145,60 @@ def test_training_with_the_autonomous_curriculum_is_algorithm_4(seed: int, succe
     assert run.world.events == paper.events
     failures_before = run.world.grasps.index(True)
     assert run.progress.practice_attempts == failures_before + 50
+    assert run.progress.steps == 60
 
 
-def test_nobody_grasps_where_p_grasp_is_0(make_run: MakeRun) -> None:
+def test_nobody_grasps_where_the_gate_is_shut(make_run: MakeRun) -> None:
     run = make_run(World(0, wanted=0.0))
     for _ in range(5):
         run.trainer.navigation_step()
     assert run.world.events == [DRIVE, LEARN_DRIVE] * 5
 
 
-def test_failed_attempts_stop_at_their_limit(make_run: MakeRun) -> None:
+def test_failed_attempts_stop_at_their_limit_after_each_navigation_step(make_run: MakeRun) -> None:
     run = make_run(World(0, success=0.0, wanted=1.0), num_grasp=3)
-    run.trainer.navigation_step()
-    assert run.world.events == [DRIVE, *[GRASP, LEARN_GRASP] * 3, LEARN_DRIVE]
-
-
-def test_gate_grasps_in_proportion_to_its_probability(make_run: MakeRun) -> None:
-    run = make_run(World(0, success=0.0, wanted=0.0), num_grasp=1)
-    run.policy.floor_probability = 0.3
-    for _ in range(600):
+    for _ in range(3):
         run.trainer.navigation_step()
-    assert run.progress.attempts / 600 == pytest.approx(0.3, abs=4 * (0.21 / 600) ** 0.5)
-
-
-def test_first_steps_are_uniform_and_later_ones_the_policys(make_run: MakeRun) -> None:
-    run = make_run(World(0, wanted=0.0), random_steps=20)
-    for _ in range(25):
-        run.trainer.navigation_step()
-    assert [action == POLICY_DRIVE for action in run.world.actions] == [False] * 20 + [True] * 5
-    assert len({tuple(action.values()) for action in run.world.actions}) == 21
-
-
-def test_cells_are_uniform_until_the_ensemble_has_begun_to_learn(make_run: MakeRun) -> None:
-    run = make_run(World(0, success=0.0, wanted=1.0), num_grasp=2, min_attempts_to_update=10)
-    for _ in range(8):
-        run.trainer.navigation_step()
+    turn = [*[GRASP, LEARN_GRASP] * 3, DRIVE, LEARN_DRIVE]
+    assert run.world.events == [DRIVE, LEARN_DRIVE, *turn, *turn]
     grasps = [action for action in run.world.actions if action["skill.pos"] == Skill.GRASP]
-    cells = [xy_to_cell(action["skill_x.pos"], action["skill_y.pos"]) for action in grasps]
-    assert cells[10:] == [SAMPLED_CELL] * 6
-    assert len(set(cells[:10])) > 5
-    assert all(0 <= cell < GRID**2 for cell in cells)
+    assert {xy_to_cell(action["skill_x.pos"], action["skill_y.pos"]) for action in grasps} == {CELL}
 
 
 @pytest.mark.parametrize(("curriculum", "phase"), [("none", Phase.LEARNING), ("autonomous", Phase.CURRICULUM)])
 def test_learner_is_told_why_it_was_grasped(curriculum: str, phase: Phase, make_run: MakeRun) -> None:
     """A frozen ensemble learns from curricula only."""
-    run = make_run(World(0, success=0.0, wanted=1.0), curriculum)
-    for _ in range(3):
+    run = make_run(World(0, success=0.0, wanted=1.0), curriculum, num_start=2)
+    for _ in range(4):
         run.trainer.navigation_step()
-    assert run.trainer.learner.phases == [phase] * 6
+    assert set(run.learner.phases) == {phase}
+    assert len(run.learner.phases) == run.progress.attempts >= 6
+
+
+# --- What the policy sees, and what is recorded of it ----------------------------------------------------------
+@pytest.mark.parametrize("curriculum", ["none", "stationary", "autonomous"])
+def test_each_observation_is_observed_once_in_order(curriculum: str, make_run: MakeRun) -> None:
+    run = make_run(World(1), curriculum, num_stationary=10, num_stop=4, num_max=20, put_in_reach=lambda: True)
+    while run.trainer.in_stationary_curriculum:
+        run.trainer.stationary_attempt()
+    for _ in range(40):
+        run.trainer.navigation_step()
+    assert run.policy.observed == list(range(1, run.world.looks + 1))
+    assert run.progress.pseudo_reset_steps > 0
+
+
+@pytest.mark.parametrize("curriculum", ["none", "stationary", "autonomous"])
+def test_each_frame_keeps_what_was_believed_of_its_own_picture(curriculum: str, make_run: MakeRun) -> None:
+    run = make_run(World(1), curriculum, num_stationary=10, num_stop=4, num_max=20)
+    while run.trainer.in_stationary_curriculum:
+        run.trainer.stationary_attempt()
+    for _ in range(40):
+        run.trainer.navigation_step()
+    outcomes = run.learner.outcomes
+    assert [o["complementary_info.grasp_probability"] for o in outcomes] == [o["number"] / 1024 for o in outcomes]
+    grasped = [action["skill.pos"] == Skill.GRASP for action in run.world.actions]
+    means = [o["complementary_info.grasp_mean"] for o in outcomes]
+    assert means == [0.75 if grasp else -1 for grasp in grasped], "of attempts only"
 
 
 # --- Stationary curriculum -----------------------------------------------------------------------------------
@@ -231,16 +233,15 @@ def test_interventions_are_counted_and_seen(make_run: MakeRun) -> None:
 
     def person() -> bool:
         asked.append(world.holding)
-        world.grasp_wanted = len(asked) == 3
-        return world.grasp_wanted
+        return len(asked) == 3
 
-    run, seen = make_run(world, "stationary", put_in_reach=person), []
+    run = make_run(world, "stationary", put_in_reach=person)
     for _ in range(3):
         run.trainer.stationary_attempt()
-        seen.append(run.policy.grasp_probability)
     assert run.progress.interventions == 1
-    assert seen == [0.0, 0.0, 1.0], "the attempt looks at what the person has done"
     assert asked == [False] * 3
+    numbers = [outcome["number"] for outcome in run.learner.outcomes]
+    assert numbers == [1, 2, 4], "the third attempt looks at what the person has done, and is recorded so"
 
 
 def test_no_curriculum_is_stationary_by_itself(make_run: MakeRun) -> None:
@@ -261,34 +262,36 @@ def test_stationary_curriculum_tries_to_drop_again_before_it_goes_on(make_run: M
 
 
 def test_practice_ends_where_nothing_can_be_dropped_and_the_next_step_carries_it_away(make_run: MakeRun) -> None:
-    run = make_run(World(0, success=1.0), "autonomous", num_stop=5, num_max=1000)
-    run.world.stuck = True
+    run = make_run(World(0, success=1.0, stuck=True), "autonomous", num_stop=5, num_max=1000)
     run.trainer.navigation_step()
     paper = World(0, success=1.0, stuck=True)
-    paper.events = [DRIVE, PRACTICE, LEARN_GRASP, DROP, LEARN_DRIVE]
-    paper.holding = True
+    paper.events, paper.holding = [PRACTICE, LEARN_GRASP, DROP], True
     pseudo_reset(paper)
-    assert run.world.events == paper.events
+    assert run.world.events == [*paper.events, DRIVE, LEARN_DRIVE]
     assert run.progress.attempts == 1
     run.world.stuck = paper.stuck = False
     before = len(run.world.events)
     run.trainer.navigation_step()
     paper.events = []
     pseudo_reset(paper)
-    assert run.world.events[before:][: len(paper.events) + 1] == [*paper.events, DRIVE]
+    assert run.world.events[before:][: len(paper.events) + 1] == [*paper.events, PRACTICE]
 
 
 # --- Stopping ------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("frames", [1, 3, 30])
-def test_practice_stops_when_told(frames: int, make_run: MakeRun) -> None:
-    world = World(1, success=0.5)
-    run = make_run(world, "autonomous", should_stop=lambda: len(world.actions) >= frames, num_stop=1000, num_start=1000)
-    run.trainer.navigation_step()
-    assert len(world.actions) <= frames + 1, "at most the first frame of a pseudo-reset follows"
+@pytest.mark.parametrize("curriculum", ["none", "autonomous"])
+def test_a_turn_ends_soon_after_it_is_told_to_stop(frames: int, curriculum: str, make_run: MakeRun) -> None:
+    world = World(1, success=0.5, wanted=1.0)
+    run = make_run(world, curriculum, should_stop=lambda: len(world.actions) >= frames, num_stop=1000, num_start=1000)
+    while len(world.actions) < frames:
+        run.trainer.navigation_step()
+    assert len(world.actions) == frames
 
 
 def test_pseudo_reset_stops_when_told(make_run: MakeRun) -> None:
     world = World(0, success=1.0, wanted=1.0)
     run = make_run(world, should_stop=lambda: len(world.actions) >= 4)
-    run.trainer.navigation_step()
+    for _ in range(2):
+        run.trainer.navigation_step()
+    assert world.events[:3] == [DRIVE, LEARN_DRIVE, GRASP]
     assert len(world.actions) == 4

@@ -18,6 +18,7 @@ from relmm.features import (
     MAX_THETA_VEL,
     MAX_X_VEL,
     STATE_KEY,
+    STATE_NAMES,
     Skill,
     in_grasp_area,
 )
@@ -118,14 +119,15 @@ def test_a_state_without_velocities_is_refused(kind, make_controller, make_batch
     """As `lerobot-rollout` of lerobot 0.6.0 gives it; the policy would read other numbers than it thinks."""
     batch = make_batch(empty)
     batch[STATE_KEY] = batch[STATE_KEY][:, 2:]
-    with pytest.raises(ConfigError, match=r"holds 8 numbers instead of the 10 of x\.vel, .*install lerobot 0\.6\.1"):
+    words = rf"holds {len(STATE_NAMES) - 2} numbers instead of {len(STATE_NAMES)}, x\.vel to .*lerobot 0\.6\.1"
+    with pytest.raises(ConfigError, match=words):
         make_controller(kind).select_action(batch)
 
 
 @pytest.mark.parametrize(
     ("features", "message"),
     [
-        ({STATE_KEY: PolicyFeature(FeatureType.STATE, (10,))}, "needs a picture .*, but there is none"),
+        ({STATE_KEY: PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))}, "needs a picture .*, but there is none"),
         ({IMAGE_KEY: PolicyFeature(FeatureType.VISUAL, (3, 64, 64))}, r"but there is one of shape \(3, 64, 64\)"),
         ({IMAGE_KEY: PolicyFeature(FeatureType.VISUAL, (3, 100, 100))}, "needs observation.state to hold x.vel, "),
     ],
@@ -134,6 +136,20 @@ def test_other_robots_are_refused(kind, features: dict[str, PolicyFeature], mess
     config = PreTrainedConfig.get_choice_class(kind)(device="cpu", input_features=features)
     with pytest.raises(ConfigError, match=message):
         get_policy_class(kind)(config)
+
+
+def test_an_observation_that_was_watched_is_not_observed_again(kind, make_controller, make_batch, empty) -> None:
+    policy, observed = make_controller(kind), []
+    policy.observe = lambda image, state, row: observed.append(image)
+    batch, row = make_batch(empty), policy.row(0)
+    policy.select_action(batch)
+    policy.observe(empty, batch[STATE_KEY][0].numpy(), row)  # as `Actor.watch` does
+    row.observed = True
+    assert len(observed) == 2
+    policy.select_action(batch)
+    assert len(observed) == 2
+    policy.select_action(batch)
+    assert len(observed) == 3, "the next one is another"
 
 
 @pytest.mark.parametrize(("setting", "value"), [("num_grasp", 0), ("seed", -1)])

@@ -13,10 +13,13 @@ from relmm.errors import RobotError
 from relmm.features import (
     ACTION_NAMES,
     BASKET_XY,
+    DRIVE_PULSE_S,
     GRASP_X,
     GRASP_Y,
     MAX_THETA_VEL,
     MAX_X_VEL,
+    MOTION_NAMES,
+    SCAN_NAMES,
     STATE_NAMES,
     Skill,
     action_dict,
@@ -86,6 +89,15 @@ def test_the_state_is_in_the_units_of_the_vocabulary(robot: LocobotSim) -> None:
     assert state["elbow.pos"] == pytest.approx(np.degrees(REST_POSE[2]), abs=3)  # degrees
     assert state["gripper.pos"] == pytest.approx(0.044, abs=0.002)  # m
     assert state["holding.pos"] == state["bumper.pos"] == 0.0
+
+
+def test_motion_and_scan_stand_under_their_names(robot: LocobotSim) -> None:
+    robot.send_action({"x.vel": 0.4, "theta.vel": 100.0})
+    state, skills = robot.get_observation(), robot.skills
+    assert skills.motion()[1] > 0.01
+    assert len(set(skills.scan())) > 5
+    assert [state[name] * DRIVE_PULSE_S for name in MOTION_NAMES] == pytest.approx(skills.motion().tolist())
+    assert [state[name] for name in SCAN_NAMES] == skills.scan().tolist()
 
 
 def test_action_features_are_the_five_actions(robot: LocobotSim) -> None:

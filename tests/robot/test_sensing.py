@@ -3,10 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from relmm.features import SCAN_BEARINGS, SCAN_RANGE
 from relmm.geometry import CAMERAS, CameraGeometry, arm_forward, arm_inverse
 from relmm.robot.body import BodyState
 from relmm.robot.sensing import (
+    OBSTACLE_HEIGHT,
     OBSTACLE_RADIUS,
+    OWN_RADIUS,
     ContactDetector,
     ObstacleDetector,
     grips_something,
@@ -137,6 +140,85 @@ def test_what_stands_beside_the_arm_does_not_obstruct_it(camera: CameraGeometry)
 def test_bare_floor_and_nothing_measured_do_not_obstruct_the_arm(camera: CameraGeometry) -> None:
     for depth in (floor_depth(camera), np.zeros(camera.size[::-1], np.uint16)):
         assert not ObstacleDetector(camera).obstructs_arm(depth, [REACHING, PRESENT_POSE])
+
+
+# --- Scan ----------------------------------------------------------------------------------------------------
+LEVEL = CameraGeometry(position=(0.05, 0.0, 0.5), pitch=0.0, fov=(60.0, 60.0))
+BEARINGS = np.array(SCAN_BEARINGS)
+
+
+def post_depth(camera: CameraGeometry, distance: float, bearing: float, half_width: float = 0.03) -> np.ndarray:
+    """A flat post, 1 m high, that faces the robot's centre."""
+    facing = np.array([np.cos(np.radians(bearing)), np.sin(np.radians(bearing)), 0.0])
+    directions, origin = rays(camera), np.array(camera.position)
+    depth = (distance - origin @ facing) / np.maximum(directions @ facing, 1e-9)
+    points = origin + directions * depth[..., None]
+    beside = points[..., :2] @ np.array([-facing[1], facing[0]])
+    hit = (np.abs(beside) < half_width) & (points[..., 2] > 0) & (points[..., 2] < 1.0)
+    return np.where(hit, depth * 1000, floor_depth(camera)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("front", [0.4, 0.6])
+def test_a_scan_of_a_wall_is_its_distance_in_each_direction(camera: CameraGeometry, front: float) -> None:
+    scan = ObstacleDetector(camera).scan(box_depth(camera, front, 2.0, 1.0))
+    seen = scan < SCAN_RANGE
+    assert set(np.diff(BEARINGS[seen])) == {3}
+    assert set(range(-27, 28, 3)) <= set(BEARINGS[seen])
+    nearest, farthest = (front / np.cos(np.radians(np.abs(BEARINGS[seen]) + edge)) for edge in (-1.5, 1.5))
+    nearest[BEARINGS[seen] == 0] = front
+    assert np.all(scan[seen] > nearest - 0.003)
+    assert np.all(scan[seen] < farthest + 0.003)
+
+
+@pytest.mark.parametrize("bearing", [-21, -12, 0, 9, 21])
+@pytest.mark.parametrize("distance", [0.32, 0.5, 0.7])
+def test_a_post_is_seen_where_it_stands_and_nowhere_else(camera: CameraGeometry, distance: float, bearing: int) -> None:
+    scan = ObstacleDetector(camera).scan(post_depth(camera, distance, bearing))
+    assert scan[bearing == BEARINGS] == pytest.approx(distance, abs=0.003)
+    half = np.degrees(np.arctan2(0.03, distance))
+    assert set(scan[np.abs(BEARINGS - bearing) > half + 1.5]) == {SCAN_RANGE}
+
+
+def test_the_nearer_of_two_things_counts(camera: CameraGeometry) -> None:
+    depths = [post_depth(camera, 0.4, 0.0), box_depth(camera, 0.6, 2.0, 1.0)]
+    scan = ObstacleDetector(camera).scan(np.minimum(*depths))
+    assert scan[BEARINGS == 0] == pytest.approx(0.4, abs=0.003)
+    assert scan[BEARINGS == 12] == pytest.approx(0.6 / np.cos(np.radians(12)), abs=0.01)
+
+
+def test_a_scan_without_obstacles_reaches_its_range(camera: CameraGeometry) -> None:
+    low = box_depth(camera, 0.4, 0.5, OBSTACLE_HEIGHT[0] - 0.01)
+    for depth in (floor_depth(camera), np.zeros(camera.size[::-1], np.uint16), low):
+        assert set(ObstacleDetector(camera).scan(depth)) == {SCAN_RANGE}
+
+
+def test_the_robot_does_not_scan_itself(camera: CameraGeometry) -> None:
+    depth = box_depth(camera, OWN_RADIUS - 0.02, 0.08, 1.0)
+    assert (depth != floor_depth(camera)).any()
+    assert set(ObstacleDetector(camera).scan(depth)) == {SCAN_RANGE}
+
+
+@pytest.mark.parametrize(("pixels", "distance"), [(2, SCAN_RANGE), (3, 0.6), (4, 0.6)])
+def test_a_direction_needs_three_points(camera: CameraGeometry, pixels: int, distance: float) -> None:
+    wall, depth = box_depth(camera, 0.6, 2.0, 1.0), np.zeros(camera.size[::-1], np.uint16)
+    points = np.column_stack([np.full(pixels, 0.6), np.zeros(pixels), 0.1 + 0.03 * np.arange(pixels)])
+    column, row = np.rint(camera.project(points)).astype(int).T
+    depth[row, column] = wall[row, column]
+    scan = ObstacleDetector(camera).scan(depth)
+    assert scan[BEARINGS == 0] == pytest.approx(distance, abs=0.003)
+    assert set(scan[BEARINGS != 0]) == {SCAN_RANGE}
+
+
+@pytest.mark.parametrize(("front", "distance"), [(2.5, 2.5), (SCAN_RANGE + 0.1, SCAN_RANGE)])
+def test_a_scan_ends_at_its_range(front: float, distance: float) -> None:
+    scan = ObstacleDetector(LEVEL).scan(box_depth(LEVEL, front, 5.0, 0.65))
+    assert scan[BEARINGS == 0] == pytest.approx(distance, abs=0.003)
+
+
+def test_what_passes_over_the_robot_is_not_scanned() -> None:
+    depth = box_depth(LEVEL, 1.5, 5.0, 1.2)
+    below = np.array(LEVEL.position)[2] + rays(LEVEL)[..., 2] * depth / 1000 < OBSTACLE_HEIGHT[1]
+    assert set(ObstacleDetector(LEVEL).scan(np.where(below, 0, depth))) == {SCAN_RANGE}
 
 
 # --- Stopping on contact -------------------------------------------------------------------------------------

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
-from relmm.features import BASKET_XY, DRIVE_PULSE_S, GRASP_X, MAX_THETA_VEL, MAX_X_VEL
-from relmm.geometry import camera_geometry
-from relmm.robot.body import BUMPER_CENTRE, MAX_OPENING
+from relmm.features import BASKET_XY, DRIVE_PULSE_S, GRASP_X, MAX_THETA_VEL, MAX_X_VEL, SCAN_BEARINGS
+from relmm.geometry import camera_geometry, moved
+from relmm.robot.body import BUMPER_CENTRE, MAX_OPENING, BodyState
 from relmm.robot.sensing import ObstacleDetector
 from relmm.robot.skills import REST_POSE, Skills
 from relmm.sim.body import SimBody
@@ -105,25 +106,6 @@ def test_turning_left_while_driving_goes_left(body: SimBody, skills: Skills) -> 
     assert displacement(body, start)[1] > 0.01
 
 
-def test_the_last_velocity_is_what_was_driven(body: SimBody, skills: Skills) -> None:
-    skills.navigate(0.3, -60.0)
-    x_vel, theta_vel = skills.last_velocity
-    assert x_vel == pytest.approx(0.3, abs=0.03)
-    assert theta_vel == pytest.approx(-60.0, abs=6.0)
-
-
-@pytest.mark.parametrize(("x", "x_vel"), [(1.2, 0.0), (1.25, MAX_X_VEL)])
-def test_the_last_velocity_tells_of_turns_away_from_obstacles(body: SimBody, x: float, x_vel: float) -> None:
-    """The motion of the whole step, the way back from a wall and the turn included, over the length of one pulse."""
-    put_robot(body, x, 0.0, 0.0)
-    skills, before = Skills(body, np.random.default_rng(0)), body.truth.robot()
-    skills.navigate(x_vel, 0.0)
-    turned = displacement(body, before)[2]
-    assert abs(turned) > 20
-    assert skills.last_velocity[1] * DRIVE_PULSE_S == pytest.approx(turned, abs=3.0)
-    assert skills.last_velocity[0] * DRIVE_PULSE_S == pytest.approx(body.truth.robot()[0] - before[0], abs=0.03)
-
-
 def test_the_base_stands_still_after_each_step(body: SimBody, skills: Skills) -> None:
     rng = np.random.default_rng(1)
     for _ in range(5):
@@ -131,6 +113,103 @@ def test_the_base_stands_still_after_each_step(body: SimBody, skills: Skills) ->
         before = body.truth.robot()
         body.wait(0.5)
         assert body.truth.robot() == pytest.approx(before, abs=0.002)
+
+
+# --- Motion --------------------------------------------------------------------------------------------------
+class ExactBody:
+    """Wheels that do at once what they are told, and a camera that sees nothing."""
+
+    camera = camera_geometry("paper")
+
+    def __init__(self) -> None:
+        self._velocity = (0.0, 0.0)
+        self._state = BodyState(0.0, 7.0, -300.0, REST_POSE, REST_POSE, MAX_OPENING, 0)  # it has a life behind it
+
+    def drive(self, x_vel: float, theta_vel: float) -> None:
+        self._velocity = x_vel, theta_vel
+
+    def state(self) -> BodyState:
+        return self._state
+
+    def capture(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((100, 100, 3), np.uint8), np.zeros((100, 100), np.uint16)
+
+    def wait(self, seconds: float) -> None:
+        x_vel, theta_vel = self._velocity
+        travelled, heading = self._state.travelled + x_vel * seconds, self._state.heading + theta_vel * seconds
+        self._state = replace(self._state, travelled=travelled, heading=heading)
+
+
+def test_motion_of_an_arc_is_that_of_the_circle() -> None:
+    skills = Skills(ExactBody(), np.random.default_rng(0))  # type: ignore[arg-type]
+    assert skills.motion().tolist() == [0.0, 0.0, 0.0]
+    for x_vel, theta_vel in ((0.4, 100.0), (0.4, -100.0), (0.1, 25.0)):
+        skills.navigate(x_vel, theta_vel)
+        turn, radius = np.radians(theta_vel * DRIVE_PULSE_S), x_vel / np.radians(theta_vel)
+        expected = radius * np.sin(turn), radius * (1 - np.cos(turn)), np.degrees(turn)
+        np.testing.assert_allclose(skills.motion(), expected, rtol=1e-3)
+    skills.navigate(0.3, 0.0)
+    np.testing.assert_allclose(skills.motion(), [0.3 * DRIVE_PULSE_S, 0, 0], atol=1e-9)
+    skills.navigate(0.0, 0.0)
+    assert skills.motion().tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("x_vel", "theta_vel"), [(MAX_X_VEL, MAX_THETA_VEL), (0.3, -60.0), (0.0, 90.0)])
+def test_motion_is_how_the_robot_has_moved(body: SimBody, skills: Skills, x_vel: float, theta_vel: float) -> None:
+    start = body.truth.robot()
+    skills.navigate(x_vel, theta_vel)
+    forward, left, turned = displacement(body, start)
+    assert skills.motion()[:2] == pytest.approx((forward, left), abs=0.003)
+    assert skills.motion()[2] == pytest.approx(turned, abs=1.5)
+
+
+@pytest.mark.parametrize(("x", "x_vel"), [(1.1, MAX_X_VEL), (1.2, 0.0), (1.25, MAX_X_VEL)])
+def test_motion_tells_of_turns_away_from_obstacles(body: SimBody, x: float, x_vel: float) -> None:
+    """The whole step counts: the drive, the way back from a wall, and the turn after both."""
+    put_robot(body, x, 0.0, 0.0)
+    skills, before = Skills(body, np.random.default_rng(0)), body.truth.robot()
+    skills.navigate(x_vel, 0.0)
+    forward, left, turned = displacement(body, before)
+    assert abs(turned) > 20
+    assert skills.motion()[2] == pytest.approx(turned, abs=3.0)
+    assert skills.motion()[:2] == pytest.approx((forward, left), abs=0.03)
+
+
+@pytest.mark.parametrize("place", [(0.38, 0.05), None])
+def test_an_arm_that_moves_reports_no_motion(body: SimBody, skills: Skills, place: tuple[float, float] | None) -> None:
+    skills.navigate(0.4, 60.0)
+    if place is not None:
+        put_object(body, *place)
+    assert skills.grasp(0.38, 0.05) == (place is not None)
+    assert np.abs(skills.motion() / (0.003, 0.003, 0.5)).max() < 1
+    if place is not None:
+        skills.navigate(0.4, 60.0)
+        skills.place(0.38, 0.0)
+        assert np.abs(skills.motion() / (0.003, 0.003, 0.5)).max() < 1
+
+
+def test_motions_add_up_to_the_robots_way(body: SimBody, skills: Skills) -> None:
+    """Along the walls, where it turns away, and with attempts to grasp in between."""
+    rng, pose = np.random.default_rng(2), np.array(body.truth.robot())
+    for step in range(60):
+        if step % 10 == 9:
+            skills.grasp(0.38, 0.0)
+        else:
+            skills.navigate(rng.uniform(0, MAX_X_VEL), rng.uniform(-MAX_THETA_VEL, MAX_THETA_VEL))
+        forward, left, turned = skills.motion()
+        pose = moved(pose, np.array([forward, left, np.radians(turned)]))
+    x, y, heading = body.truth.robot()
+    assert pose[:2] == pytest.approx((x, y), abs=0.06)
+    assert np.degrees((pose[2] - heading + np.pi) % (2 * np.pi) - np.pi) == pytest.approx(0.0, abs=8.0)
+
+
+def test_a_scan_sees_the_wall(body: SimBody, skills: Skills) -> None:
+    put_robot(body, 0.5, 0.0, 0.0)
+    skills.forget_picture()
+    middle = len(SCAN_BEARINGS) // 2
+    assert skills.scan()[middle] == pytest.approx(1.0, abs=0.02)
+    left = middle + SCAN_BEARINGS[middle:].index(15)
+    assert skills.scan()[left] == pytest.approx(1.0 / np.cos(np.radians(15)), abs=0.03)
 
 
 # --- Avoidance -----------------------------------------------------------------------------------------------

@@ -43,5 +43,19 @@ def test_scene_shows_the_inset():
     body.close()
     assert with_inset.shape == (SIZE[1], SIZE[0], 3)
     changed = (with_inset != without).any(axis=-1)
-    assert (with_inset[changed] == (255, 0, 0)).all()
-    assert changed.sum() > 10_000
+    assert not changed[:240].any(), "the robot's view"
+    assert not changed[:, 240:].any(), "the room"
+    assert (with_inset[270:, :240] == (255, 0, 0)).all()
+
+
+def test_scene_shows_the_caption_over_the_room():
+    body = SimBody(make_room("no_obstacles", num_objects=2), camera_geometry("paper"))
+    body.reset(np.random.default_rng(0))
+    scene = Scene(body)
+    changed = (scene.picture("two\nlines") != scene.picture("")).any(axis=-1)
+    scene.close()
+    body.close()
+    assert changed[:30, 240:].any()
+    assert changed[30:60, 240:].any()
+    assert not changed[60:].any()
+    assert not changed[:, :240].any()

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relmm.features import GRID
-from relmm.policies.controller import Row, UntrainedPolicy, drive_anywhere, grasp_cell
+from relmm.policies.controller import Row, UntrainedPolicy, grasp_cell
+from relmm.policies.pseudo_reset import drive_anywhere
 from relmm.policies.random.configuration_random import RelmmRandomConfig
 
 

@@ -1,10 +1,15 @@
-"""The grasp ensemble (paper 4.1): M networks that predict the success of an attempt in each of the 225 cells."""
+"""The grasp ensemble (paper 4.1): networks over a map of the floor that predict where an attempt would succeed.
+
+They are fully convolutional, so what one attempt teaches holds for all 225 cells, and for floor beyond the arm's reach.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -13,182 +18,170 @@ from relmm.geometry import camera_geometry
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm.floor import FloorView
 
-# Four 3x3 convolutions see four cells either side of one.
-_MARGIN = 4
-_PATCH = 2 * _MARGIN + 1
-_CROP = (38, 20, 60)  # first row, first column and side; the authors' "centre" crop lies 18 pixels lower
+MARGIN = 4  # cells that four 3x3 convolutions see either side of one
+PATCH = 2 * MARGIN + 1
+AREA = GRID + 2 * MARGIN  # cells a side of the floor that the grasp cells are judged by
+# The map reaches 2.4 m ahead and 1.2 m to either side, in grasp cells: farther, a picture shows things too small.
+_ROWS, _COLUMNS = 210, 217
+FIRST_ROW, FIRST_COLUMN = -7, -101  # of the map, counted from the grasp area's
+_STRIPS = 3  # across the map, each as wide as the camera sees the floor there
+_PRIOR_CHANNELS = 8
+_FAR_MEMBERS = 2  # that judge the strips beyond the nearest, 1 m: all would take twice as long, and no grasp is near
 
 
 @dataclass
-class Estimate:
-    """What the ensemble thinks of the grasps in some pictures.
+class Opinion:
+    """What the ensemble thinks of the floor in some pictures.
 
     Attributes:
-        mean, std: of the members' success probabilities, (batch, 225); cells row by row from near right.
+        mean, std: of the members' success probabilities on the map, 0 where it does not see, (batch, 210, 217).
     """
 
     mean: Tensor
     std: Tensor
 
-    def scores(self, mean_weight: float, std_weight: float) -> Tensor:
-        """Alpha * mean + beta * std (paper eq. 2), (batch, 225)."""
-        return mean_weight * self.mean + std_weight * self.std
+    @property
+    def cells(self) -> tuple[Tensor, Tensor]:
+        """Mean and std of the grasp cells, (batch, 225) each, row by row from near right."""
+        rows, columns = slice(-FIRST_ROW, GRID - FIRST_ROW), slice(-FIRST_COLUMN, GRID - FIRST_COLUMN)
+        return self.mean[:, rows, columns].flatten(1), self.std[:, rows, columns].flatten(1)
 
 
 class GraspEnsemble(nn.Module):
-    """The ensemble, whatever its networks look like.
+    """The ensemble.
 
     Args:
         config: of the policy.
+
+    Attributes:
+        known: of which pixels of the map it has an opinion, bool, (210, 217).
     """
+
+    known: Tensor
 
     def __init__(self, config: ReLMMConfig) -> None:
         super().__init__()
         self.config = config
-        backbone = RectifiedBackbone if config.grasp_backbone == "rectified" else DenseBackbone
-        self.backbone: RectifiedBackbone | DenseBackbone = backbone(config)
+        camera = camera_geometry(config.camera)
+        self.members = nn.ModuleList([_Member(config) for _ in range(config.num_members)])
+        self.area = FloorView(camera, -MARGIN, -MARGIN, AREA, AREA)
+        self.view = FloorView(
+            camera, FIRST_ROW - MARGIN, FIRST_COLUMN - MARGIN, _ROWS + 2 * MARGIN, _COLUMNS + 2 * MARGIN
+        )
+        # A cell is judged by the floor round it; the picture's edge looks like an object where no grasp has taught
+        # otherwise, that is, outside the grasp area.
+        outside = (self.view.grid.abs() > 1).any(dim=-1)
+        known = functional.max_pool2d(outside.float()[None], PATCH, stride=1)[0] == 0
+        reach = slice(-FIRST_ROW, GRID - FIRST_ROW), slice(-FIRST_COLUMN, GRID - FIRST_COLUMN)
+        known[reach] = ~outside[MARGIN:-MARGIN, MARGIN:-MARGIN][reach]
+        self.register_buffer("known", known, persistent=False)
+        strips = [(first, first + _ROWS // _STRIPS) for first in range(0, _ROWS, _ROWS // _STRIPS)]
+        self._strips = [_rectangle(known, *strip) for strip in strips if known[slice(*strip)].any()]
 
-    def logits(self, images: Tensor) -> Tensor:
-        """Success logits of all cells: images 0..1 (batch, 3, 100, 100) -> (members, batch, 225)."""
-        return self.backbone(images)
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next(self.parameters()).device
 
-    def estimate(self, images: Tensor) -> Estimate:
-        """Mean and standard deviation over the members, without gradients."""
-        with torch.no_grad():
-            probabilities = self.logits(images).sigmoid()
-        return Estimate(probabilities.mean(dim=0), probabilities.std(dim=0, correction=0))
+    def learned(self) -> list[nn.Parameter]:
+        """The weights that learn."""
+        return [weight for weight in self.parameters() if weight.requires_grad]
 
-    def grasp_probability(self, estimate: Estimate) -> Tensor:
-        """P[grasp] (paper eq. 3), at most 1, (batch,)."""
-        config = self.config
-        return estimate.scores(config.gate_mean_weight, config.gate_std_weight).amax(dim=1).clamp(max=1.0)
+    def to_pictures(self, image: NDArray[np.uint8]) -> Tensor:
+        """One picture, (100, 100, 3), as the ensemble takes it: 0..1, (1, 3, 100, 100)."""
+        return torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None] / 255
 
-    def sample(self, estimate: Estimate, rng: torch.Generator) -> Tensor:
-        """Cells in proportion to exp(alpha * mean + beta * std) (paper eq. 2), (batch,) int64."""
-        scores = estimate.scores(self.config.mean_weight, self.config.std_weight)
+    @torch.no_grad()
+    def look(self, images: Tensor) -> Opinion:
+        """The ensemble's opinion of all floor in view, of images 0..1, (batch, 3, 100, 100)."""
+        floor = self.view(images)
+        mean, std = floor.new_zeros(2, len(images), _ROWS, _COLUMNS)
+        for strip, (rows, columns) in enumerate(self._strips):
+            part = floor[:, :, rows.start : rows.stop + 2 * MARGIN, columns.start : columns.stop + 2 * MARGIN]
+            chances = self.logits(part, None if strip == 0 else _FAR_MEMBERS).sigmoid()
+            mean[:, rows, columns], std[:, rows, columns] = chances.mean(dim=0), chances.std(dim=0, correction=0)
+        return Opinion(mean * self.known, std * self.known)
+
+    def logits(self, floor: Tensor, members: int | None = None) -> Tensor:
+        """Success logits of all or the first members: any map of the floor (batch, 3, h, w) -> (n, batch, h-8, w-8)."""
+        floor = floor.contiguous(memory_format=torch.channels_last)
+        return torch.stack([member(floor) for member in self.members[:members]])
+
+    def sample(self, mean: Tensor, std: Tensor, rng: torch.Generator) -> Tensor:
+        """Cells in proportion to exp(alpha * mean + beta * std) (paper eq. 2): (batch, 225) twice -> (batch,) int64."""
+        scores = self.config.mean_weight * mean + self.config.std_weight * std
         return torch.multinomial(scores.softmax(dim=1).cpu(), 1, generator=rng).squeeze(1)
 
-    def loss(self, images: Tensor, cells: Tensor, successes: Tensor) -> Tensor:
+    def loss(self, areas: Tensor, cells: Tensor, successes: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy of the attempted cells (paper eq. 1): the mean over the batch, summed over the members.
 
         Args:
-            images: before the attempts, 0..1, (batch, 3, 100, 100).
+            areas: the floor before the attempts, as `area` draws it, (batch, 3, 23, 23).
             cells: attempted, (batch,) int64.
             successes: 0 or 1, (batch,).
+
+        Returns:
+            The loss, and the mean of the members' losses for logs.
         """
-        logits = self.backbone.attempted(images, cells)
-        targets = successes.to(logits.dtype).expand_as(logits)
-        return functional.binary_cross_entropy_with_logits(logits, targets, reduction="none").mean(dim=1).sum()
-
-
-class RectifiedBackbone(nn.Module):
-    """Fully convolutional networks over the map of the floor: what one cell teaches holds for all.
-
-    Args:
-        config: of the policy.
-    """
-
-    def __init__(self, config: ReLMMConfig) -> None:
-        super().__init__()
-        side = GRID + 2 * _MARGIN
-        self.mirror = config.mirror
-        self.view = FloorView(camera_geometry(config.camera), -_MARGIN, -_MARGIN, side, side)
-        self.members = nn.ModuleList([_convolutions(config) for _ in range(config.num_members)])
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Logits of all cells, (members, batch, 225)."""
-        return self.on_map(self.view(images)).flatten(2)
-
-    def on_map(self, floor: Tensor, members: int | None = None) -> Tensor:
-        """Logits on any map of the floor, by the first `members` or all: (batch, 3, h, w) -> (n, batch, h-8, w-8)."""
-        floor = floor.contiguous(memory_format=torch.channels_last)
-        return torch.stack([member(floor).squeeze(1) for member in self.members[:members]])
-
-    def first_on_map(self, floor: Tensor) -> Tensor:
-        """The same by the first member alone, (batch, h - 8, w - 8): all six would take six times as long."""
-        member = self.members[0]
-        assert isinstance(member, nn.Sequential)
-        last = member[-1]
-        assert isinstance(last, nn.Conv2d)
-        assert last.bias is not None
-        features: Tensor = member[:-1](floor.contiguous(memory_format=torch.channels_last))
-        # A convolution to one channel takes as long as one to sixteen, and one of each channel for itself a fifth.
-        by_channel = functional.conv2d(features, last.weight.transpose(0, 1), groups=features.shape[1])
-        return by_channel.sum(dim=1) + last.bias
-
-    def attempted(self, images: Tensor, cells: Tensor) -> Tensor:
-        """Logits of one cell a picture, from the floor round it alone, (members, batch)."""
-        windows = self.view(images).unfold(2, _PATCH, 1).unfold(3, _PATCH, 1)  # (batch, 3, 15, 15, 9, 9)
+        windows = areas.unfold(2, PATCH, 1).unfold(3, PATCH, 1)  # (batch, 3, 15, 15, 9, 9)
         patches = windows[torch.arange(len(cells), device=cells.device), :, cells // GRID, cells % GRID]
-        if self.mirror and self.training:
+        if self.training:
             # Left and right are alike; which half is mirrored does not matter, the batch is in random order.
             half = len(patches) // 2
             patches = torch.cat([patches[:half].flip(-1), patches[half:]])
-        return self.on_map(patches).flatten(1)
+        logits = self.logits(patches).flatten(1)
+        smoothing = self.config.smoothing
+        targets = torch.where(successes > 0.5, 1 - smoothing, smoothing).to(logits.dtype).expand_as(logits)
+        loss = functional.binary_cross_entropy_with_logits(logits, targets, reduction="none").mean(dim=1).sum()
+        return loss, {"grasp_loss": loss.item() / len(logits)}
 
 
-class DenseBackbone(nn.Module):
-    """The paper's networks: three convolutions of stride 2 over a crop of the picture, two dense layers, 225 logits.
+def _rectangle(known: Tensor, first: int, last: int) -> tuple[slice, slice]:
+    """Rows and columns of what is known in a strip of the map."""
+    columns = known[first:last].any(dim=0).nonzero()
+    return slice(first, last), slice(int(columns.min()), int(columns.max()) + 1)
 
-    Args:
-        config: of the policy.
+
+class _Member(nn.Module):
+    """One network of the ensemble: what is learned, plus a fixed random function of the floor (Osband et al. 2018).
+
+    Where nothing like it was tried, what is learned does not make up for the random part, so members disagree there
+    for as long as it takes; that is what the uncertainty bonus explores by.
     """
 
     def __init__(self, config: ReLMMConfig) -> None:
         super().__init__()
-        self.members = nn.ModuleList([_dense(config) for _ in range(config.num_members)])
+        width = config.channels
+        self.learned = nn.Sequential(
+            _convolution(3, width, 3),
+            nn.ReLU(inplace=True),
+            _convolution(width, width, 3),
+            nn.ReLU(inplace=True),
+            _convolution(width, width, 3),
+            nn.ReLU(inplace=True),
+            _convolution(width, 1, 3, bias=config.initial_logit),
+        )
+        self.prior = nn.Sequential(
+            _convolution(3, _PRIOR_CHANNELS, 5),
+            nn.ReLU(inplace=True),
+            _convolution(_PRIOR_CHANNELS, 1, 5, scale=config.prior_scale, bias=0.0),
+        ).requires_grad_(False)
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Logits of all cells, (members, batch, 225)."""
-        row, column, side = _CROP
-        crop = images[:, :, row : row + side, column : column + side] * 2 - 1
-        crop = crop.contiguous(memory_format=torch.channels_last)
-        return torch.stack([member(crop) for member in self.members])
-
-    def attempted(self, images: Tensor, cells: Tensor) -> Tensor:
-        """Logits of one cell a picture, (members, batch)."""
-        logits = self(images)
-        return logits.gather(2, cells.expand(len(logits), -1)[..., None]).squeeze(2)
+    def forward(self, floor: Tensor) -> Tensor:
+        """Logits, (batch, 3, h, w) -> (batch, h - 8, w - 8)."""
+        logits: Tensor = self.learned(floor) + self.prior(floor)
+        return logits.squeeze(1)
 
 
-def _convolutions(config: ReLMMConfig) -> nn.Sequential:
-    width = config.grasp_channels
-    net = nn.Sequential(
-        nn.Conv2d(3, width, 3),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(width, width, 3),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(width, width, 3),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(width, 1, 3),
-    )
-    for layer in net:
-        if isinstance(layer, nn.Conv2d):
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-            assert layer.bias is not None
-            nn.init.uniform_(layer.bias, -0.3, 0.3)
-    last = net[-1]
-    assert isinstance(last, nn.Conv2d)
-    assert last.bias is not None
+def _convolution(inputs: int, outputs: int, size: int, scale: float = 1.0, bias: float | None = None) -> nn.Conv2d:
+    """A layer that gives outputs about as large as its inputs, times `scale`; with random biases, or all the same."""
+    layer = nn.Conv2d(inputs, outputs, size)
+    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    assert layer.bias is not None
     with torch.no_grad():
-        # Kaiming gives outputs about as large as the inputs; scaled, members disagree by this much where nothing is
-        # known, which is what the uncertainty bonus explores by (the authors get it from unscaled pixels).
-        last.weight *= config.grasp_initial_spread
-        last.bias.fill_(config.grasp_initial_logit)
-    return net
-
-
-def _dense(config: ReLMMConfig) -> nn.Sequential:
-    width, hidden, size = config.grasp_channels, 512, _CROP[2]
-    layers: list[nn.Module] = []
-    for inputs in (3, width, width):
-        layers += [nn.Conv2d(inputs, width, 3, stride=2, padding=1), nn.ReLU()]
-        size = (size + 1) // 2
-    layers += [nn.Flatten(), nn.Linear(width * size**2, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()]
-    net = nn.Sequential(*layers, nn.Linear(hidden, GRID**2))
-    for layer in net:
-        if isinstance(layer, nn.Conv2d | nn.Linear):  # as Keras does by default
-            nn.init.xavier_uniform_(layer.weight)
-            assert layer.bias is not None
-            nn.init.zeros_(layer.bias)
-    return net
+        layer.weight *= scale
+        if bias is None:
+            layer.bias.uniform_(-0.3, 0.3)
+        else:
+            layer.bias.fill_(bias)
+    return layer

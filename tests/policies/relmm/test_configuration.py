@@ -1,149 +1,70 @@
 from __future__ import annotations
 
-import json
 import math
-from importlib.resources import files
-from typing import Any
+from dataclasses import fields
 
-import draccus
 import pytest
 from lerobot.configs.policies import PreTrainedConfig
 
 from relmm.errors import ConfigError
-from relmm.policies.relmm.configuration_relmm import _RANGES, ReLMMConfig
+from relmm.policies.controller import ControllerConfig
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 
-PRESETS = ("fast", "paper", "paper_small")
-
-PAPER: dict[str, Any] = {
-    "camera": "paper",
-    "sample": False,
-    # 4.1, Appendix "Model Architectures": M = 6 networks of width 64, alpha = beta = 10, N_grasp = 2, rate 3e-4.
-    "grasp_backbone": "dense",
-    "num_members": 6,
-    "grasp_channels": 64,
-    "mean_weight": 10.0,
-    "std_weight": 10.0,
-    "num_grasp": 2,
-    "grasp_learning_rate": 3e-4,
-    # The gate and the batches as in the authors' code.
-    "gate_mean_weight": 1.0,
-    "gate_std_weight": 1.0,
-    "grasp_threshold": 0.5,
-    "grasp_batch_size": 256,
-    "grasp_updates": 1,
-    "min_failure_loss": 0.0,
-    "background_weight": 0.0,
-    "freeze_grasping": False,
-    # 4.4, Appendix "Grasping Curriculum": N_st, N_bt, N_start, N_stop, N_max.
-    "num_stationary": 2000,
-    "min_attempts_to_update": 300,
-    "num_start": 10,
-    "num_stop": 50,
-    "num_max": 2000,
-    # 4.2 and the authors' SAC.
-    "navigation_encoder": "paper",
-    "navigation_hidden": 512,
-    "orderly_search": False,
-    "relabel": True,
-    "relabel_failed": True,
-    "relabel_terminal": False,
-    "pseudo_reset_share": 0.0,
-    "navigation_learning_rate": 3e-4,
-    "navigation_batch_size": 128,
-    "navigation_updates": 1,
-    "random_steps": 500,
-    "min_steps_to_update": 250,
-    "gamma": 0.99,
-    "tau": 0.005,
-    "actor_tau": 1.0,
-    "target_entropy": -2.0,
-    "initial_temperature": 1.0,
-    "clip_targets": False,
-    "mirror": False,
-    "recolour": False,
-    "tidied_share": 0.0,
-    "refreshed_maps": 0,
-}
-SMALL = {"grasp_channels": 32, "grasp_batch_size": 64, "navigation_encoder": "paper_small", "navigation_batch_size": 64}
+OWN = [field.name for field in fields(ReLMMConfig) if field.name not in {f.name for f in fields(ControllerConfig)}]
+NUMBERS = [name for name in OWN if type(getattr(ReLMMConfig, name)) in (int, float)]
 
 
-def preset(name: str) -> PreTrainedConfig:
-    settings = json.loads((files("relmm.policies.relmm") / "presets" / f"{name}.json").read_text(encoding="utf-8"))
-    return draccus.decode(PreTrainedConfig, {**settings["policy"], "device": "cpu"})
-
-
-def bad_values() -> list[tuple[str, float]]:
-    cases: list[tuple[str, float]] = []
-    for name, (low, high) in _RANGES.items():
-        cases += [(name, low - 1), (name, math.nan), (name, math.inf)]
-        if high < math.inf:
-            cases.append((name, high + 1))
-    return cases
-
-
-def test_preset_fast_is_the_default() -> None:
-    assert preset("fast") == ReLMMConfig(device="cpu")
-
-
-@pytest.mark.parametrize(("name", "wanted"), [("paper", PAPER), ("paper_small", {**PAPER, **SMALL})])
-def test_preset_has_the_values_of_the_paper(name: str, wanted: dict[str, Any]) -> None:
-    config = preset(name)
+def test_lerobot_finds_it_by_its_name(tmp_path) -> None:
+    config = PreTrainedConfig.get_choice_class("relmm")(device="cpu", num_members=3, std_weight=2.5, sample=True)
     assert isinstance(config, ReLMMConfig)
-    assert {field: getattr(config, field) for field in wanted} == wanted
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_saved_and_loaded_a_preset_is_the_same(name: str, tmp_path) -> None:
-    config = preset(name)
     config._save_pretrained(tmp_path)
     assert PreTrainedConfig.from_pretrained(tmp_path) == config
 
 
-@pytest.mark.parametrize(("name", "value"), bad_values())
-def test_value_out_of_range_is_refused_by_name(name: str, value: float) -> None:
+def test_every_number_has_a_range() -> None:
+    """So no setting is taken unchecked; `tests/policies/test_learning.py` tries the limits."""
+    assert set(ReLMMConfig.ranges) == set(NUMBERS)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_default_lies_within_its_range(name: str) -> None:
+    low, high = ReLMMConfig.ranges[name]
+    assert low <= getattr(ReLMMConfig(device="cpu"), name) <= high
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_members", 0),
+        ("learning_rate", 0.0),
+        ("smoothing", 0.6),
+        ("grasp_threshold", 1.1),
+        ("unseen_promise", -0.1),
+        ("failure_steps", math.nan),
+        ("std_weight", math.inf),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=rf"policy\.{name} is {value}, but must be at least"):
         ReLMMConfig(device="cpu", **{name: value})
 
 
-@pytest.mark.parametrize("name", _RANGES)
-def test_limits_of_a_range_are_allowed(name: str) -> None:
-    for value in _RANGES[name]:
-        if math.isfinite(value):
-            assert getattr(ReLMMConfig(device="cpu", **{name: value}), name) == value
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_target_entropy_must_be_a_number(value: float) -> None:
-    with pytest.raises(ConfigError, match=r"policy\.target_entropy"):
-        ReLMMConfig(device="cpu", target_entropy=value)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"grasp_backbone": "resnet"}, r"policy\.grasp_backbone is 'resnet': choose one of rectified, dense"),
-        ({"navigation_encoder": "lidar"}, r"policy\.navigation_encoder is 'lidar': choose one of floor, paper, paper_"),
-        ({"camera": "webcam"}, "camera 'webcam': choose one of paper, d435"),
-        ({"grasp_backbone": "dense"}, r"policy\.navigation_encoder=floor .* also choose --policy.grasp_backbone=recti"),
-    ],
-)
-def test_unknown_parts_are_refused(settings: dict[str, str], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        ReLMMConfig(device="cpu", **settings)
-
-
-@pytest.mark.parametrize("num_grasp", [1, 3])
-def test_batches_hold_the_attempts_after_a_step_and_the_picture_after_them(num_grasp: int) -> None:
-    config = ReLMMConfig(device="cpu", num_grasp=num_grasp)
-    wanted = list(range(num_grasp + 2))
-    assert config.observation_delta_indices == wanted
-    assert config.reward_delta_indices is None, "LeRobot cannot stream several numbers of a column"
-    assert config.action_delta_indices == wanted
-
-
-def test_fingerprint_tells_networks_of_other_shapes_apart() -> None:
+def test_batches_hold_the_present_frame_alone() -> None:
     config = ReLMMConfig(device="cpu")
-    same = ReLMMConfig(device="cpu", grasp_learning_rate=1e-4, sample=True, gamma=0.9)
-    assert same.fingerprint() == config.fingerprint()
-    for change in ({"num_members": 5}, {"camera": "d435"}, {"navigation_encoder": "paper"}, {"navigation_hidden": 9}):
-        assert ReLMMConfig(device="cpu", **change).fingerprint() != config.fingerprint()
+    assert config.observation_delta_indices is config.action_delta_indices is config.reward_delta_indices is None
+
+
+def test_fingerprint_tells_what_cannot_share_weights_apart(make_config) -> None:
+    config = make_config()
+    for same in ({"learning_rate": 0.1}, {"sample": True}, {"prior_scale": 1.0}, {"failure_steps": 3.0}):
+        assert make_config(**same).fingerprint() == config.fingerprint()
+    for other in ({"num_members": 5}, {"channels": 9}, {"camera": "d435"}):
+        assert make_config(**other).fingerprint() != config.fingerprint()
+
+
+def test_lerobot_train_learns_at_the_rate_that_is_set(make_config) -> None:
+    preset = make_config(learning_rate=0.02).get_optimizer_preset()
+    assert preset.lr == 0.02
+    assert preset.weight_decay == 0, "weights of the ensemble are not pulled to 0"
+    assert ReLMMPolicy(make_config()).get_optim_params()

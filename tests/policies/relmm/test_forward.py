@@ -9,279 +9,169 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from torch import Tensor
+from torch.utils.data import default_collate
 
-import relmm.plugin  # noqa: F401
 from relmm.errors import ConfigError
-from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_KEY, Skill, action_dict
+from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_NAMES, Phase, Skill, action_dict
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
-from relmm.policies.relmm.navigation import NavigationBatch, from_navigation_steps
 
+RECORDED = Path(__file__).parents[3] / "datasets" / "diverse_scripted"
+STATE = np.zeros(len(STATE_NAMES), np.float32)
+SKILLS = {"d": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
 MakePolicy = Callable[..., ReLMMPolicy]
-# Batches of LeRobot's are large enough, and are learned from as they are.
-PLAIN = {
-    "offline_grasp_updates": 0,
-    "grasp_batch_size": 1,
-    "navigation_batch_size": 1,
-    "mirror": False,
-    "recolour": False,
-    "tidied_share": 0.0,
-}
-Frame = tuple[NDArray[np.uint8], dict[str, float], float]  # picture, action, reward
-DRIVE = action_dict(x_vel=0.3, theta_vel=-40.0)
-DRIVEN = (0.28, -37.0)  # by the wheels, m/s and deg/s
 
 
-@pytest.fixture
-def green(make_green: MakePolicy) -> ReLMMPolicy:
-    return make_green(**PLAIN)
+def picture(number: int) -> np.ndarray:
+    return np.random.default_rng(number).integers(0, 256, (100, 100, 3), np.uint8)
 
 
-def as_batch(policy: ReLMMPolicy, episode: list[Frame], frames: list[int]) -> dict[str, Tensor]:
-    """What LeRobot's dataset gives for some frames: beyond the episode's ends, its first or last frame again."""
+def action_of(kind: str, number: int) -> list[float]:
+    cell = grasp_cell(number * 7 % 225)
+    x, y = cell["skill_x.pos"], cell["skill_y.pos"]
+    return [action_dict(SKILLS[kind], 0.1, 20.0, x, y)[name] for name in ACTION_NAMES]
 
-    def look(deltas: list[int]) -> tuple[list[list[Frame]], Tensor]:
-        wanted = [[frame + delta for delta in deltas] for frame in frames]
-        rows = [[episode[min(max(index, 0), len(episode) - 1)] for index in row] for row in wanted]
-        return rows, torch.tensor([[not 0 <= index < len(episode) for index in row] for row in wanted])
 
-    deltas = policy.config.observation_delta_indices
-    rows, padded = look(deltas)
-    action_rows, action_padded = look(policy.config.action_delta_indices)
+def as_batch(frames: str, first: int = 0) -> dict[str, Any]:
+    """What LeRobot gives for frames: drives (d), attempts that fail (f) or do not (s), placements (p)."""
+    numbers = range(first, first + len(frames))
     return {
-        IMAGE_KEY: torch.from_numpy(np.stack([[f[0] for f in row] for row in rows])).permute(0, 1, 4, 2, 3) / 255,
-        "action": torch.tensor([[[f[1][name] for name in ACTION_NAMES] for f in row] for row in action_rows]),
-        "next.reward": torch.tensor([row[0][2] for row in rows]),
-        STATE_KEY: torch.tensor(
-            [[[*(DRIVEN if delta > 0 else (0.1, 20.0)), *[0.0] * 8] for delta in deltas] for _ in frames]
-        ),
-        "index": torch.tensor(frames),
-        f"{IMAGE_KEY}_is_pad": padded,
-        "action_is_pad": action_padded,
+        IMAGE_KEY: torch.from_numpy(np.stack([picture(number) for number in numbers])).permute(0, 3, 1, 2) / 255,
+        "action": torch.tensor([action_of(kind, number) for kind, number in zip(frames, numbers, strict=True)]),
+        "next.reward": torch.tensor([float(kind == "s") for kind in frames]),
+        "index": torch.tensor(numbers),
     }
 
 
-def make_episode(draw, *outcomes: str) -> list[Frame]:
-    """An episode of drives (d), failed attempts (f), successes (s) and placements (p), each with its own picture."""
-    actions = {"d": DRIVE, "f": grasp_cell(40), "s": grasp_cell(112), "p": action_dict(Skill.PLACE)}
-    return [
-        (
-            draw(100 + index, color=(0, 18 + 5 * index, 0)),
-            actions[outcome],
-            float(outcome == "s"),
-        )
-        for index, outcome in enumerate(outcomes)
-    ]
-
-
-def expected_batch(policy: ReLMMPolicy, episode: list[Frame], after: int, success: bool) -> NavigationBatch:
-    """The transition of the drive in frame 0."""
-    pictures = torch.cat([policy.to_pictures(episode[frame][0]) for frame in (0, after)])
-    attempted = episode[1][1]["skill.pos"] == Skill.GRASP
-    chance = 0.0 if attempted else policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
-    observations = policy.observer(pictures, policy.grasping)
-    return NavigationBatch(
-        observations[:1],
-        torch.ones(1),
-        from_navigation_steps(torch.tensor([list(DRIVE.values())])),
-        torch.tensor([[0.0 if success else chance - 1]]),
-        observations[1:],
-        -torch.ones(1),
-        torch.tensor([[0.0 if success else 1 - chance]]),
-        torch.tensor([1]),
-        torch.tensor([[DRIVEN]]),
-    )
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "after", "success"),
-    [
-        ("dd", 1, False),
-        ("dfd", 2, False),
-        ("dffd", 3, False),
-        ("dpd", 1, False),
-        ("ddfs", 1, False),
-        ("ds", 1, True),
-        ("dfs", 2, True),
-        ("df", 1, False),
-        ("dff", 1, False),
-    ],
-)
-def test_forward_learns_a_drive_as_the_replay_knows_it(outcomes, after, success, green: ReLMMPolicy, draw) -> None:
-    """Its own row tells what the robot saw and did; those of the attempts after it, in any order, what came of it."""
-    episode = make_episode(draw, *outcomes)
-    attempts = [frame for frame, (_, action, _) in enumerate(episode) if action["skill.pos"] == Skill.GRASP]
-    for frames in ([0, *attempts], [*attempts[::-1], 0]):
-        torch.manual_seed(7)
-        logs = green.forward(as_batch(green, episode, frames))[1]
-        assert logs is not None
-        torch.manual_seed(7)
-        batch, noise = expected_batch(green, episode, after, success), torch.randn(2, 1, 2)
-        wanted = green.navigation.loss(batch, noise, offline=True)[1]
-        assert {name: logs[name] for name in wanted} == pytest.approx(wanted, rel=1e-4)
-
-
-@pytest.mark.parametrize("outcomes", ["d", "dfffd", "dfffs"])
-def test_forward_skips_a_drive_whose_outcome_it_does_not_see(outcomes: str, green: ReLMMPolicy, draw) -> None:
-    """Nothing follows it, or a curriculum's attempts, of which there may be more than a batch holds."""
-    loss, logs = green.forward(as_batch(green, make_episode(draw, *outcomes), [0]))
-    assert loss.item() == 0.0
-    assert logs == {}
-    loss.backward()
-
-
-def test_forward_learns_attempts_with_the_loss_of_the_ensemble(green: ReLMMPolicy, draw) -> None:
-    episode = make_episode(draw, *"dffsp")
-    loss, logs = green.forward(as_batch(green, episode, [1, 3, 4]))
-    pictures = torch.cat([green.to_pictures(episode[frame][0]) for frame in (1, 3)])
-    attempts = green.grasping.loss(pictures, torch.tensor([40, 112]), torch.tensor([0.0, 1.0])).item()
-    assert logs == {"grasp_loss": pytest.approx(attempts / green.config.num_members)}
-    rng = torch.Generator().manual_seed(0)
-    others = torch.cat([green.to_pictures(episode[frame][0]) for frame in (1, 3, 4)])
-    background = green.observer.background_loss(others, green.grasping, rng, offline=True).item()
-    assert loss.item() == pytest.approx(attempts + green.config.background_weight * background, rel=1e-3)
-
-
-def test_forward_adds_both_losses_and_update_moves_the_targets(make_policy_of: MakePolicy, draw) -> None:
-    policy = make_policy_of(seed=1, background_weight=0.0, conservative_weight=0.0, **PLAIN)
-    episode = make_episode(draw, *"dfdfs")
-    batch = as_batch(policy, episode, range(5))
-    loss, logs = policy.forward(batch)
-    parts = logs["grasp_loss"] * policy.config.num_members + logs["critic_loss"] + logs["actor_loss"]
-    entropy_gap = -logs["entropy"] + policy.config.target_entropy
-    assert loss.item() == pytest.approx(parts - logs["temperature"] * entropy_gap, rel=1e-4)
-    loss.backward()
-    torch.optim.Adam(policy.get_optim_params()).step()
-    target = next(policy.navigation.targets.parameters())
-    before = target.clone()
-    policy.update()
-    assert not torch.equal(target, before)
-
-
-def test_forward_remembers_maps_by_number_but_not_those_of_another_dataset(green: ReLMMPolicy, draw) -> None:
-    """The same numbers with other pictures are other frames; the ensemble may have moved on meanwhile."""
-    losses = []
-    for life in ("dfds", "ddfs"):
-        batch = as_batch(green, make_episode(draw, *life), [0, 2])
-        for known in (batch.keys() - {"index"}, batch, batch):
-            torch.manual_seed(7)
-            green.rng.manual_seed(7)
-            losses.append(green.forward({name: batch[name] for name in known})[0].item())
-    assert losses[0] == pytest.approx(losses[1]) == pytest.approx(losses[2])
-    assert losses[3] == pytest.approx(losses[4]) == pytest.approx(losses[5])
-    assert losses[0] != pytest.approx(losses[3])
-
-
 @pytest.fixture
-def shown(monkeypatch) -> Callable[[ReLMMPolicy], dict[str, list[Any]]]:
-    """What a policy's two losses are computed from, by module."""
+def shown(monkeypatch) -> Callable[[ReLMMPolicy], list[tuple[Tensor, Tensor, Tensor]]]:
+    """What a policy's loss is computed from."""
 
-    def watch(policy: ReLMMPolicy) -> dict[str, list[Any]]:
-        seen: dict[str, list[Any]] = {"grasping": [], "navigation": []}
-        for name, arguments in seen.items():
-            loss = getattr(policy, name).loss
-
-            def record(*given, loss=loss, seen=arguments, **options):
-                seen.append(given[0])
-                return loss(*given, **options)
-
-            monkeypatch.setattr(getattr(policy, name), "loss", record)
+    def watch(policy: ReLMMPolicy) -> list[tuple[Tensor, Tensor, Tensor]]:
+        seen: list[tuple[Tensor, Tensor, Tensor]] = []
+        loss = policy.grasping.loss
+        monkeypatch.setattr(policy.grasping, "loss", lambda *given: (seen.append(given), loss(*given))[1])
         return seen
 
     return watch
 
 
-@pytest.mark.parametrize("grasp_updates", [0, 2])
-def test_forward_tops_up_small_batches_with_what_earlier_ones_showed(
-    grasp_updates: int, make_policy_of: MakePolicy, draw, shown
-) -> None:
-    """Loading is slow; to learn twice from what was loaded is not. What is new is always there."""
-    sizes = {"grasp_batch_size": 20, "navigation_batch_size": 30, "offline_grasp_updates": grasp_updates}
-    policy = make_policy_of(**PLAIN | sizes).train()
-    seen, episode = shown(policy), make_episode(draw, *"ddfds")
-    for frames in ([0, 2], [1, 3, 4]):
-        policy.forward(as_batch(policy, episode, frames))
-    pictures = [policy.to_pictures(picture)[0] for picture, _, _ in episode]
-    if grasp_updates:
-        assert seen["navigation"] == []
-        assert [len(batch) for batch in seen["grasping"]] == [20, 20]
-        assert torch.equal(seen["grasping"][1][0], pictures[4])
-        assert any(torch.equal(each, pictures[2]) for each in seen["grasping"][1][1:])
-    else:
-        assert seen["grasping"] == []
-        assert [len(batch.rewards) for batch in seen["navigation"]] == [30, 30]
-        maps = [policy.observer(picture[None], policy.grasping)[0] for picture in pictures]
-        assert torch.equal(seen["navigation"][1].observations[0], maps[1])
-        assert any(torch.equal(each, maps[0]) for each in seen["navigation"][1].observations[2:])
+def test_the_loss_is_that_of_learning_online(make_policy: MakePolicy) -> None:
+    policy, frames = make_policy(seed=2), "dfsfpfdsf"
+    learner = policy.make_learner(seed=0, capacity=50)
+    for number, kind in enumerate(frames):
+        learner.add(picture(number), STATE, np.array(action_of(kind, number), np.float32), kind == "s", Phase.LEARNING)
+    wanted, wanted_logs = policy.grasping.loss(*learner.attempts.all(torch.device("cpu")))
+    loss, logs = policy.forward(as_batch(frames))
+    assert loss.item() == pytest.approx(wanted.item(), rel=1e-6)
+    assert logs == wanted_logs
+    assert loss.requires_grad
 
 
-def test_forward_learns_to_grasp_and_then_to_navigate(make_policy_of: MakePolicy, draw, tmp_path: Path) -> None:
-    """Also if it goes on from a checkpoint. Navigation learns from maps that are no longer changing."""
-    policy = make_policy_of(**PLAIN | {"offline_grasp_updates": 2}).train()
-    learned = []
-    for _ in range(4):
-        optimizer = torch.optim.Adam(policy.get_optim_params())
-        loss, logs = policy.forward(as_batch(policy, make_episode(draw, *"dfds"), range(4)))
-        loss.backward()
-        optimizer.step()
-        policy.update()
-        learned.append((set(logs) & {"grasp_loss", "critic_loss"}).pop())
-        policy.save_pretrained(tmp_path)
-        policy = ReLMMPolicy.from_pretrained(tmp_path).train()
-    assert learned == ["grasp_loss", "grasp_loss", "critic_loss", "critic_loss"]
+def test_while_it_does_not_train_a_batch_is_judged_alone(make_policy: MakePolicy, shown) -> None:
+    policy = make_policy().train()
+    policy.forward(as_batch("ssss", first=50))
+    policy.eval()
+    seen = shown(policy)
+    for _ in range(2):
+        policy.forward(as_batch("dfs"))
+    assert [successes.tolist() for _, _, successes in seen] == [[False, True]] * 2
+    assert len(policy._attempts) == 4, "and not remembered"
 
 
-def test_forward_judges_both_while_it_does_not_train(make_policy_of: MakePolicy, draw, shown) -> None:
-    """Each frame that LeRobot holds out, and no other."""
-    policy = make_policy_of(**PLAIN | {"grasp_batch_size": 3, "navigation_batch_size": 4})
-    seen, episode = shown(policy), make_episode(draw, *"ddfds")
-    for frames in ([2], [1, 3, 4]):
-        policy.forward(as_batch(policy, episode, frames))
-    assert [len(pictures) for pictures in seen["grasping"]] == [1, 1]
-    assert [len(batch.rewards) for batch in seen["navigation"]] == [1]
+def test_while_training_it_learns_from_earlier_batches_too(make_policy: MakePolicy, shown) -> None:
+    policy = make_policy(batch_size=200, seed=1).train()
+    seen = shown(policy)
+    for first, frames in ((0, "ff"), (2, "ds"), (4, "dd")):
+        policy.forward(as_batch(frames, first))
+    assert [len(cells) for _, cells, _ in seen] == [200] * 3
+    last = set(zip(seen[-1][1].tolist(), seen[-1][2].tolist(), strict=True))
+    assert last == {(0, False), (7, False), (21, True)}
 
 
-def test_forward_waits_until_it_knows_what_came_of_a_step(make_policy_of: MakePolicy, draw, shown) -> None:
-    """LeRobot shuffles: the attempts after a step may be in a later batch."""
-    policy = make_policy_of(**PLAIN).train()
-    seen, episode = shown(policy), make_episode(draw, *"ddfs")
-    loss, logs = policy.forward(as_batch(policy, episode, [1]))
+def test_a_frame_that_is_shown_again_counts_once(make_policy: MakePolicy) -> None:
+    policy = make_policy().train()
+    for _ in range(3):
+        policy.forward(as_batch("dsfd"))
+    assert len(policy._attempts) == 2
+    policy.forward(as_batch("s", first=9))
+    assert len(policy._attempts) == 3
+
+
+def test_without_numbers_of_frames_each_is_new(make_policy: MakePolicy) -> None:
+    policy = make_policy().train()
+    batch = as_batch("sf")
+    del batch["index"]
+    for _ in range(2):
+        loss, _ = policy.forward(batch)
+    assert len(policy._attempts) == 4
+    assert loss.requires_grad
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_a_batch_without_attempts_teaches_nothing_and_can_be_stepped_on(training: bool, make_policy) -> None:
+    policy = make_policy().train(training)
+    before = [weight.clone() for weight in policy.get_optim_params()]
+    optimizer = torch.optim.SGD(policy.get_optim_params(), lr=1.0)
+    loss, logs = policy.forward(as_batch("dpd"))
     assert (loss.item(), logs) == (0.0, {})
-    policy.forward(as_batch(policy, episode, [2, 0]))
-    assert seen["navigation"][-1].rewards.tolist() != [[0.0]], "the second drive is waiting for the second attempt"
-    policy.forward(as_batch(policy, episode, [3]))
-    assert seen["navigation"][-1].rewards.tolist() == [[0.0]]
-    assert len(seen["navigation"]) == 2
+    loss.backward()
+    optimizer.step()
+    assert all(torch.equal(*each) for each in zip(before, policy.get_optim_params(), strict=True))
 
 
-def test_forward_begins_anew_when_it_remembers_too_much(make_policy_of: MakePolicy, draw, shown, monkeypatch) -> None:
-    monkeypatch.setattr("relmm.policies.relmm.offline.CAPACITY", 3)
-    policy = make_policy_of(**PLAIN | {"navigation_batch_size": 100}).train()
-    seen, episode = shown(policy), make_episode(draw, *"dddddddd")
-    old = policy.observer(policy.to_pictures(episode[0][0]), policy.grasping)[0]
-    for frames in ([0, 1, 2], [3, 4, 5], [5, 6]):
-        policy.forward(as_batch(policy, episode, frames))
-    remembered = [any(torch.equal(each, old) for each in batch.observations) for batch in seen["navigation"]]
-    assert remembered == [True, False, False]
-    assert [len(batch.rewards) for batch in seen["navigation"]] == [100, 100, 100]
+def test_a_dataset_without_rewards_is_refused(make_policy: MakePolicy) -> None:
+    batch = as_batch("ff")
+    for missing in (0.0, None):  # LeRobot's processors put in 0 where there is no column
+        with pytest.raises(ConfigError, match=r"no column next\.reward"):
+            make_policy().forward({**batch, "next.reward": missing})
 
 
-def test_forward_learns_from_tidier_maps(make_policy_of: MakePolicy, draw, shown) -> None:
-    policy = make_policy_of(
-        **PLAIN | {"tidied_share": 1.0, "navigation_batch_size": 50}, grasp_initial_logit=5.0
-    ).train()
-    seen, episode = shown(policy), make_episode(draw, *"dd")
-    policy.forward(as_batch(policy, episode, [0]))
-    whole = policy.observer(policy.to_pictures(episode[0][0]), policy.grasping)[0, 0]
-    graspable = seen["navigation"][0].observations[:, 0]
-    assert ((graspable == whole) | (graspable == 0)).all()
-    assert (graspable != whole).flatten(1).any(dim=1).float().mean() > 0.9
+def test_rewards_may_have_a_dimension_of_their_own(make_policy: MakePolicy) -> None:
+    policy, batch = make_policy(), as_batch("fsf")
+    loss, _ = policy.forward(batch)
+    columns = {name: batch[name][:, None] for name in ("next.reward", "index")}
+    assert policy.forward({**batch, **columns})[0].item() == loss.item()
 
 
-def test_dataset_without_rewards_is_refused(green: ReLMMPolicy, draw) -> None:
-    batch = as_batch(green, make_episode(draw, *"dd"), [0])
-    batch["next.reward"] = 0.0  # which LeRobot's processors put in where there is none
-    with pytest.raises(ConfigError, match=r"no column next\.reward"):
-        green.forward(batch)
+# --- LeRobot's datasets --------------------------------------------------------------------------------------
+def frames_of(**settings: Any) -> list[dict[str, Any]]:
+    dataset = LeRobotDataset("local/diverse", root=RECORDED, episodes=[0, 1, 2], return_uint8=False, **settings)
+    return list(dataset)
+
+
+def is_attempt(frame: dict[str, Any]) -> bool:
+    return round(float(frame["action"][2])) == Skill.GRASP
+
+
+def test_stock_training_computes_the_loss_of_learning_online(make_policy: MakePolicy) -> None:
+    """LeRobot's dataset, batches and preprocessor against the learner."""
+    policy, frames = make_policy(seed=2), frames_of()
+    learner = policy.make_learner(seed=0, capacity=len(frames))
+    for frame in frames:
+        image = (frame[IMAGE_KEY] * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+        learner.add(image, STATE, frame["action"].numpy(), bool(frame["next.reward"] > 0), Phase.LEARNING)
+    loss, logs = policy.forward(make_pre_post_processors(policy.config)[0](default_collate(frames)))
+    areas, cells, successes = learner.attempts.all(torch.device("cpu"))
+    wanted, wanted_logs = policy.grasping.loss(areas, cells, successes)
+    assert len(cells) == sum(map(is_attempt, frames)) >= 2
+    assert successes.any()
+    assert loss.item() == pytest.approx(wanted.item(), rel=1e-3)
+    assert logs == pytest.approx(wanted_logs, rel=1e-3)
+
+
+def test_no_success_is_lost_to_image_augmentation(make_policy: MakePolicy) -> None:
+    """The picture of a frame is another one whenever LeRobot shows it."""
+    policy = make_policy().train()
+    frames = frames_of(image_transforms=ImageTransforms(ImageTransformsConfig(enable=True)))
+    for seed in range(2):
+        order = np.random.default_rng(seed).permutation(len(frames))
+        for chosen in np.array_split(order, 8):
+            policy.forward(default_collate([frames[index] for index in chosen]))
+    _, _, successes = policy._attempts.all(torch.device("cpu"))
+    assert len(successes) == sum(map(is_attempt, frames))
+    assert int(successes.sum()) == sum(bool(frame["next.reward"] > 0) for frame in frames) > 0

@@ -1,0 +1,43 @@
+"""The pseudo-reset (paper 4.3): carry what was picked up to somewhere else, put it down there, and drive away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from relmm.features import MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict
+
+# m, where the object is put down. The authors do it at 0.40 in front of the robot; nearer, fewer end up at a wall.
+PLACE_XY = (0.33, 0.0)
+_TURN_ROUND_STEPS = 6  # 162 degrees: in front there often is a wall by then, and things at a wall are hard to pick up
+_TURN_AWAY_STEPS = 4  # 108 degrees, so that driving on does not push what was just put down
+
+
+def drive_anywhere(rng: np.random.Generator) -> dict[str, float]:
+    """A navigation step drawn uniformly from all of them."""
+    return action_dict(x_vel=rng.uniform(0, MAX_X_VEL), theta_vel=rng.uniform(-MAX_THETA_VEL, MAX_THETA_VEL))
+
+
+def random_pseudo_reset(
+    rng: np.random.Generator, steps: int, holding: Callable[[], bool]
+) -> Iterator[dict[str, float]]:
+    """The actions of the paper's pseudo-reset, which drives at random.
+
+    Args:
+        rng: of the drives.
+        steps: random navigation steps before and after the object is put down.
+        holding: whether something is in the gripper now; it may be lost on the way.
+    """
+    for _ in range(steps):
+        yield drive_anywhere(rng)
+    direction = float(rng.choice((-1.0, 1.0)))
+    for _ in range(_TURN_ROUND_STEPS):
+        yield action_dict(theta_vel=direction * MAX_THETA_VEL)
+    if holding():
+        yield action_dict(Skill.PLACE, x=PLACE_XY[0], y=PLACE_XY[1])
+    direction = float(rng.choice((-1.0, 1.0)))
+    for _ in range(_TURN_AWAY_STEPS):
+        yield action_dict(theta_vel=direction * MAX_THETA_VEL)
+    for _ in range(steps):
+        yield drive_anywhere(rng)

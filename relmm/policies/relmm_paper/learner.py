@@ -1,0 +1,117 @@
+"""Updates of the policy from the replay: sample, relabel, loss, step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from relmm.features import Phase
+from relmm.policies.learning import Learner
+from relmm.policies.relmm_paper.navigation import ACTIONS, NavigationBatch, from_navigation_steps
+from relmm.policies.relmm_paper.replay import Replay, to_pictures
+
+if TYPE_CHECKING:
+    from relmm.policies.relmm_paper.modeling_relmm_paper import RelmmPaperPolicy
+
+
+class RelmmPaperLearner(Learner):
+    """Trains a policy's two modules, each with its own optimiser.
+
+    Args:
+        policy: to train; its config says how.
+        seed: of the batches.
+        capacity: frames to learn from that are kept in memory.
+
+    Attributes:
+        replay: what has been added.
+    """
+
+    def __init__(self, policy: RelmmPaperPolicy, seed: int, capacity: int) -> None:
+        self.policy, self.config, self.replay = policy, policy.config, Replay(capacity)
+        self.rng = np.random.default_rng(seed)
+        self.noise = torch.Generator().manual_seed(seed)
+        grasping, navigation = policy.get_optim_params()
+        self.optimizers = {
+            "grasping": torch.optim.Adam(grasping["params"], lr=grasping["lr"], fused=True),
+            "navigation": torch.optim.Adam(navigation["params"], lr=navigation["lr"], fused=True),
+        }
+        self.logs = {}
+
+    # --- Filling ------------------------------------------------------------------------------------------
+    @property
+    def attempts_since_first_success(self) -> int:
+        """See `Learner.attempts_since_first_success`."""
+        return self.replay.attempts_since_first_success
+
+    def add(
+        self,
+        picture: NDArray[np.uint8],
+        state: NDArray[np.float32],
+        action: NDArray[np.float32],
+        success: bool,
+        phase: int,
+    ) -> None:
+        """See `Learner.add`; the paper's policy has no use for the state."""
+        self.replay.add(picture, action, success, phase)
+        # A policy that had learned before knows of more than there is in the replay.
+        self.policy.attempts_seen.clamp_(min=len(self.replay.attempts))
+        self.policy.steps_seen.clamp_(min=self.replay.navigation_steps)
+
+    def save_episode(self) -> None:
+        """See `Learner.save_episode`."""
+        self.replay.save_episode()
+
+    # --- Grasping -----------------------------------------------------------------------------------------
+    def update_grasping(self, phase: int) -> None:
+        """See `Learner.update_grasping`."""
+        attempts = self.replay.attempts
+        begun = len(attempts) >= self.config.min_attempts_to_update and self.replay.available(attempts) > 0
+        frozen = self.config.freeze_grasping and phase != Phase.CURRICULUM
+        if begun and not frozen:
+            for _ in range(self.config.grasp_updates):
+                self._step("grasping", *self._grasp_loss())
+
+    def _grasp_loss(self) -> tuple[Tensor, dict[str, float]]:
+        attempts = self.replay.attempts
+        rows = self.replay.sample(attempts, self.config.grasp_batch_size, self.rng)
+        cells, successes = (self._on_device(attempts[name][rows]) for name in ("cell", "success"))
+        return self.policy.grasping.loss(self._pictures(attempts["frame"][rows]), cells, successes)
+
+    # --- Navigation ---------------------------------------------------------------------------------------
+    def update_navigation(self) -> None:
+        """See `Learner.update_navigation`."""
+        steps, size = self.replay.steps, self.config.navigation_batch_size
+        if len(steps) >= self.config.min_steps_to_update and self.replay.available(steps) > 0:
+            for _ in range(self.config.navigation_updates):
+                batch = self.navigation_batch(self.replay.sample(steps, size, self.rng))
+                noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)
+                self._step("navigation", *self.policy.navigation.loss(batch, noise))
+                self.policy.update()
+
+    def navigation_batch(self, rows: NDArray[np.int64]) -> NavigationBatch:
+        """Some of the replay's navigation steps, rewarded by the current ensemble."""
+        steps = self.replay.steps
+        velocities = np.stack([steps["x_vel"][rows], steps["theta_vel"][rows]], axis=1)
+        return self.policy.navigation_batch(
+            self._pictures(steps["frame"][rows]),
+            from_navigation_steps(self._on_device(velocities)),
+            self._pictures(steps["next"][rows]),
+            self._on_device(steps["success"][rows]),
+        )
+
+    def _pictures(self, frames: NDArray[np.int64]) -> Tensor:
+        return to_pictures(self.replay.pictures(frames), self.policy.weights_device)
+
+    def _on_device(self, values: NDArray[np.generic]) -> Tensor:
+        return torch.from_numpy(values).to(self.policy.weights_device)
+
+    def _step(self, module: str, loss: Tensor, logs: dict[str, float]) -> None:
+        optimizer = self.optimizers[module]
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        self.logs |= logs
