@@ -262,7 +262,7 @@ def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
 def _train_on_stream(run: Run, root: Path) -> None:
     config = run.config
     run.load_data()
-    follower = EpisodeFollower(root, saved_episodes(root) if config.resume else 0)
+    follower = EpisodeFollower(root, saved_episodes(root) if config.resume else 0, run.policy.config.camera)
 
     def episodes() -> Iterator[Any]:
         while not run.signals.stopped:
