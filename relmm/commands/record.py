@@ -68,7 +68,7 @@ class RecordConfig:
         seed: of everything random; the same seed records the same dataset.
         resume: continue the dataset in its folder.
         max_steps: navigation steps after which an episode is cut off.
-        pseudo_reset_steps: random navigation steps before and after a picked-up object is put down again.
+        pseudo_reset_steps: navigation steps, at most, before and after a picked-up object is put down again.
     """
 
     robot: RobotConfig

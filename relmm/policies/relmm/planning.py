@@ -97,8 +97,11 @@ class Ways:
         self.costs = np.where(free < TIGHT, _BLOCKED, cost)
         graph = csr_matrix((_LENGTHS * self.costs.ravel()[_TO], _TO, _ROWS), shape=(_WAYS**2, _WAYS**2))
         self._start = int(self._index(start))
-        lengths, self._before = dijkstra(graph, indices=self._start, return_predecessors=True)
-        self._lengths = lengths
+        self._lengths, self._before = dijkstra(graph, indices=self._start, return_predecessors=True)
+
+    def cost(self, places: FloatArray) -> FloatArray:
+        """Cost of a metre at places, (..., 2); 1 on free floor."""
+        return np.asarray(self.costs.ravel()[self._index(places)])
 
     def length(self, places: FloatArray) -> FloatArray:
         """Cost of the way to places, (..., 2), in metres of free floor."""
@@ -314,8 +317,7 @@ def _waypoint(start: FloatArray, way: FloatArray, ways: Ways) -> FloatArray:
     reached = way[0]
     for place in way:
         line = start + np.linspace(0.3, 1, 8)[:, None] * (place - start)
-        costs = ways.costs.ravel()[ways._index(line)]
-        if np.any(costs >= 1 + _PUSHING) and np.linalg.norm(reached - start) > 0.2:
+        if np.any(ways.cost(line) >= 1 + _PUSHING) and np.linalg.norm(reached - start) > 0.2:
             return reached
         reached = place
     return reached
