@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from relmm.features import FloatArray
 from relmm.policies.pseudo_reset import PLACE_XY
+from relmm.policies.relmm.driving import STEP_LENGTH
 from relmm.policies.relmm.memory import CELL, SIDE, FloorMemory, cells
-from relmm.policies.relmm.planning import COARSE, STEP_LENGTH, WAY_PLACES, Ways
+from relmm.policies.relmm.ways import MIDDLE, WAY_PLACES, Ways
 
 _FREE = 0.4  # m to walls, obstacles and other things, where there is such a place
 _LEAST_WAY, _MOST_WAY = 0.5, 0.6  # m, and share of the steps there are
@@ -38,11 +39,10 @@ def choose_place(
     """
     clearance = memory.clearance()
     ways = Ways(memory.pose[:2], clearance, things)
-    middle = slice(COARSE // 2, None, COARSE)
-    free = np.minimum(clearance, _gaps(things))[middle, middle]
+    free = np.minimum(clearance, _gaps(things))[MIDDLE, MIDDLE]
     lengths = ways.lengths()
     reachable = (lengths > _LEAST_WAY) & (lengths < max(_MOST_WAY * steps * STEP_LENGTH, 2 * _LEAST_WAY))
-    good = reachable & (memory.unseen()[middle, middle] < _SEEN)
+    good = reachable & (memory.unseen()[MIDDLE, MIDDLE] < _SEEN)
     if not good.any():
         return None
     enough = good & (free >= _FREE)

@@ -34,6 +34,8 @@ class ReLMMConfig(LearningConfig):
         updates: per attempt.
         smoothing: of the labels: a success counts as 1 - smoothing, a failure as smoothing. Surer networks would agree
             on everything, also on what they have never tried.
+        recolor: how much stronger or weaker each colour of every second attempt of a batch is made, at most, after the
+            three have changed places: what is learned of some things then holds for others. 0 for colours as they were.
         freeze_grasping: the ensemble learns in the curriculum only.
         failure_steps: what a failed grasp costs a plan, in navigation steps.
         unseen_promise: success that floor promises which was not seen from near.
@@ -56,6 +58,7 @@ class ReLMMConfig(LearningConfig):
     batch_size: int = 64
     updates: int = 4
     smoothing: float = 0.03
+    recolor: float = 0.4
     freeze_grasping: bool = False
 
     failure_steps: float = 25.0
@@ -75,6 +78,7 @@ class ReLMMConfig(LearningConfig):
         "batch_size": (1, math.inf),
         "updates": (0, math.inf),
         "smoothing": (0, 0.5),
+        "recolor": (0, 1),
         "failure_steps": (_TINY, math.inf),
         "unseen_promise": (0, 1),
     }

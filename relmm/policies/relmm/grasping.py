@@ -99,7 +99,8 @@ class GraspEnsemble(nn.Module):
         for strip, (rows, columns) in enumerate(self._strips):
             part = floor[:, :, rows.start : rows.stop + 2 * MARGIN, columns.start : columns.stop + 2 * MARGIN]
             chances = self.logits(part, None if strip == 0 else _FAR_MEMBERS).sigmoid()
-            mean[:, rows, columns], std[:, rows, columns] = chances.mean(dim=0), chances.std(dim=0, correction=0)
+            middle = mean[:, rows, columns] = chances.mean(dim=0)
+            std[:, rows, columns] = (chances - middle).square_().mean(dim=0).sqrt_()
         return Opinion(mean * self.known, std * self.known)
 
     def logits(self, floor: Tensor, members: int | None = None) -> Tensor:
@@ -107,33 +108,62 @@ class GraspEnsemble(nn.Module):
         floor = floor.contiguous(memory_format=torch.channels_last)
         return torch.stack([member(floor) for member in self.members[:members]])
 
+    def _patch_logits(self, patches: Tensor) -> Tensor:
+        """`logits` of single cells, (batch, 3, 9, 9) -> (n, batch): all members at once, twice as fast on so little."""
+        logits = torch.zeros(())
+        for part in ("learned", "prior"):
+            hidden = patches
+            for layers in zip(*(getattr(member, part) for member in self.members), strict=True):
+                if isinstance(layers[0], nn.Conv2d):
+                    weight, bias = (torch.cat([getattr(each, name) for each in layers]) for name in ("weight", "bias"))
+                    hidden = functional.conv2d(hidden, weight, bias, groups=1 if hidden is patches else len(layers))
+                else:
+                    hidden = layers[0](hidden)
+            logits = logits + hidden.flatten(1).T
+        return logits
+
     def sample(self, mean: Tensor, std: Tensor, rng: torch.Generator) -> Tensor:
         """Cells in proportion to exp(alpha * mean + beta * std) (paper eq. 2): (batch, 225) twice -> (batch,) int64."""
         scores = self.config.mean_weight * mean + self.config.std_weight * std
         return torch.multinomial(scores.softmax(dim=1).cpu(), 1, generator=rng).squeeze(1)
 
-    def loss(self, areas: Tensor, cells: Tensor, successes: Tensor) -> tuple[Tensor, dict[str, float]]:
+    def loss(
+        self, areas: Tensor, cells: Tensor, successes: Tensor, noise: torch.Generator | None = None
+    ) -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy of the attempted cells (paper eq. 1): the mean over the batch, summed over the members.
 
         Args:
             areas: the floor before the attempts, as `area` draws it, (batch, 3, 23, 23).
             cells: attempted, (batch,) int64.
             successes: 0 or 1, (batch,).
+            noise: for mirrored and recoloured floor, None for floor as it was.
 
         Returns:
             The loss, and the mean of the members' losses for logs.
         """
         windows = areas.unfold(2, PATCH, 1).unfold(3, PATCH, 1)  # (batch, 3, 15, 15, 9, 9)
         patches = windows[torch.arange(len(cells), device=cells.device), :, cells // GRID, cells % GRID]
-        if self.training:
+        if noise is not None:
             # Left and right are alike; which half is mirrored does not matter, the batch is in random order.
             half = len(patches) // 2
             patches = torch.cat([patches[:half].flip(-1), patches[half:]])
-        logits = self.logits(patches).flatten(1)
+            if self.config.recolor > 0:  # every second one: where colours matter, that must be learned as well
+                patches[::2] = _recolored(patches[::2], self.config.recolor, noise)
+        logits = self._patch_logits(patches)
         smoothing = self.config.smoothing
         targets = torch.where(successes > 0.5, 1 - smoothing, smoothing).to(logits.dtype).expand_as(logits)
         loss = functional.binary_cross_entropy_with_logits(logits, targets, reduction="none").mean(dim=1).sum()
         return loss, {"grasp_loss": loss.item() / len(logits)}
+
+
+def _recolored(patches: Tensor, most: float, noise: torch.Generator) -> Tensor:
+    """Floor whose colours have changed places and strength: what it shows can be grasped in any colour."""
+    count = len(patches)
+    order = torch.rand(count, 3, generator=noise).argsort(dim=1).to(patches.device)
+    shuffled = patches[torch.arange(count, device=patches.device)[:, None], order]
+    strength, shift = (2 * torch.rand(2, count, 3, 1, 1, generator=noise) - 1).to(patches.device) * most
+    lit = (shuffled + 1) / 2 * (1 + strength) + shift / 4
+    return lit.clamp(0, 1) * 2 - 1
 
 
 def _rectangle(known: Tensor, first: int, last: int) -> tuple[slice, slice]:

@@ -117,7 +117,7 @@ class ReLMMLearner(Learner):
         optimizer = self.optimizers["grasping"]
         for _ in range(self._config.updates):
             batch = self.attempts.sample(self._config.batch_size, self.rng, self._grasping.device)
-            loss, self.logs = self._grasping.loss(*batch)
+            loss, self.logs = self._grasping.loss(*batch, self.noise)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()

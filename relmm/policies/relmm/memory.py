@@ -120,18 +120,19 @@ class FloorMemory:
         self._seen[weight > 0] = self.steps
         self._seen_near[here[..., 3] > 0.5] = self.steps
         # What is too near to be looked at is not worth coming back for.
-        self._seen_near[((PLACES - self.pose[:2]) ** 2).sum(axis=-1) < _UNDER**2] = self.steps
+        _circle(self._seen_near, self.pose[:2], _UNDER, self.steps)
         self._mark_standing(scan, weight > 0)
 
     def leave_alone(self, place: FloatArray, radius: float, steps: int) -> None:
         """Expect nothing round a place of the map, m, (2,), for a while, whatever it looks like."""
-        self._left_alone[((PLACES - place) ** 2).sum(axis=-1) < radius**2] = self.steps + steps
+        _circle(self._left_alone, place, radius, self.steps + steps)
 
     def leave_area_alone(self, steps: int) -> None:
         """Likewise for all that lies well inside the grasp area."""
-        x, y = np.moveaxis(self.to_robot(PLACES), -1, 0)
+        around = _around(self.pose[:2], GRASP_X[1] + GRASP_Y[1])
+        x, y = np.moveaxis(self.to_robot(PLACES[around]), -1, 0)
         inside = (x > GRASP_X[0] + _INSIDE) & (x < GRASP_X[1] - _INSIDE) & (np.abs(y) < GRASP_Y[1] - _INSIDE)
-        self._left_alone[inside] = self.steps + steps
+        self._left_alone[around][inside] = self.steps + steps
 
     # --- Reading ------------------------------------------------------------------------------------------
     def success(self, std_weight: float) -> NDArray[np.float32]:
@@ -227,6 +228,18 @@ def _shifted(layer: NDArray[np.float32], shift: NDArray[np.intp], empty: float) 
 def cells(places: FloatArray) -> NDArray[np.intp]:
     """Indices of the cells that hold places of the map, (..., 2), those outside at its edge."""
     return np.clip(np.floor(places / CELL).astype(np.intp) + SIDE // 2, 0, SIDE - 1)
+
+
+def _around(place: FloatArray, radius: float) -> tuple[slice, slice]:
+    """The cells of a square round a place; all of them would take ten times as long."""
+    first, last = cells(place - radius), cells(place + radius) + 1
+    return slice(first[0], last[0]), slice(first[1], last[1])
+
+
+def _circle(layer: NDArray[np.float32], place: FloatArray, radius: float, value: float) -> None:
+    """Set the cells of a layer round a place."""
+    around = _around(place, radius)
+    layer[around][((PLACES[around] - place) ** 2).sum(axis=-1) < radius**2] = value
 
 
 _AXIS = (np.arange(SIDE) - SIDE / 2 + 0.5) * CELL

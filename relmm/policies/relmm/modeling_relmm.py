@@ -61,7 +61,9 @@ class ReLMMPolicy(LearningPolicy):
             self.grasping = GraspEnsemble(config)
         self.grid = FloorGrid(FIRST_ROW, FIRST_COLUMN, self.grasping.known.numpy())
         self.sampling = config.sample
-        self._attempts, self._rng = Attempts(_CAPACITY), np.random.default_rng(config.seed or 0)  # of `forward`
+        # Of `forward`.
+        self._attempts, self._rng = Attempts(_CAPACITY), np.random.default_rng(config.seed or 0)
+        self._noise = torch.Generator().manual_seed(config.seed or 0)
 
     # --- Acting -------------------------------------------------------------------------------------------
     def observe(self, image: NDArray[np.uint8], state: NDArray[np.float32], row: Row) -> None:
@@ -184,9 +186,8 @@ class ReLMMPolicy(LearningPolicy):
             return torch.stack([weight.sum() * 0.0 for weight in self.grasping.learned()]).sum(), {}
         if self.training:
             learned = attempts.sample(self.config.batch_size, self._rng, self.grasping.device)
-        else:
-            learned = attempts.all(self.grasping.device)
-        return self.grasping.loss(*learned)
+            return self.grasping.loss(*learned, self._noise)
+        return self.grasping.loss(*attempts.all(self.grasping.device))
 
     def get_optim_params(self) -> Any:
         """The ensemble's weights."""

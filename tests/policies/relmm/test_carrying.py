@@ -9,8 +9,8 @@ import pytest
 from relmm.features import Skill, action_dict
 from relmm.policies.pseudo_reset import PLACE_XY
 from relmm.policies.relmm.carrying import choose_place, is_there
+from relmm.policies.relmm.driving import STEP_LENGTH
 from relmm.policies.relmm.memory import CELL, FloorMemory
-from relmm.policies.relmm.planning import STEP_LENGTH
 
 FREE = 0.4  # m to walls and things, where there is such a place
 STEPS = 30

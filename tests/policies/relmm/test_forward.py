@@ -88,7 +88,7 @@ def test_while_training_it_learns_from_earlier_batches_too(make_policy: MakePoli
     seen = shown(policy)
     for first, frames in ((0, "ff"), (2, "ds"), (4, "dd")):
         policy.forward(as_batch(frames, first))
-    assert [len(cells) for _, cells, _ in seen] == [200] * 3
+    assert [len(cells) for _, cells, _, _ in seen] == [200] * 3
     last = set(zip(seen[-1][1].tolist(), seen[-1][2].tolist(), strict=True))
     assert last == {(0, False), (7, False), (21, True)}
 

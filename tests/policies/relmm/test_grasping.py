@@ -44,13 +44,11 @@ def make_ensemble(make_config) -> Any:
 
 def learn(ensemble: GraspEnsemble, floor: Tensor, cells: Tensor, successes: Tensor, updates: int = 150) -> None:
     optimizer = torch.optim.Adam(ensemble.learned(), lr=3e-3)
-    ensemble.train()
     for _ in range(updates):
         loss, _ = ensemble.loss(floor, cells, successes)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    ensemble.eval()
 
 
 # --- Networks ------------------------------------------------------------------------------------------------
@@ -204,7 +202,7 @@ def test_loss_is_the_smoothed_cross_entropy_of_the_attempted_cells(smoothing: fl
 
 
 def test_half_of_a_batch_is_mirrored_in_training_only(make_ensemble) -> None:
-    ensemble, floor = make_ensemble(smoothing=0.0), areas(4)
+    ensemble, floor = make_ensemble(smoothing=0.0, recolor=0.0), areas(4)
     cells, successes = torch.tensor([7, 60, 112, 200]), torch.tensor([1, 0, 0, 1])
     mirrored = floor.clone()
     mirrored[:2] = floor[:2].flip(-1)
@@ -213,9 +211,30 @@ def test_half_of_a_batch_is_mirrored_in_training_only(make_ensemble) -> None:
     with torch.no_grad():
         expected = ensemble.loss(mirrored, elsewhere, successes)[0]
         plain = ensemble.loss(floor, cells, successes)[0]
-        trained = ensemble.train().loss(floor, cells, successes)[0]
+        trained = ensemble.loss(floor, cells, successes, generator())[0]
     assert trained.item() == pytest.approx(expected.item(), rel=1e-5)
     assert trained.item() != pytest.approx(plain.item(), rel=1e-3)
+
+
+def test_colours_of_every_second_attempt_change_places_and_strength(make_ensemble, monkeypatch) -> None:
+    """Alike for all of a patch, so that what it shows keeps its shape."""
+    ensemble, seen = make_ensemble(recolor=0.4), []
+    logits = ensemble._patch_logits
+    monkeypatch.setattr(ensemble, "_patch_logits", lambda patches: (seen.append(patches), logits(patches))[1])
+    levels = torch.tensor([-0.5, 0.0, 0.5])[:, None, None]
+    floor = (levels + 0.05 * torch.linspace(-1, 1, AREA)).expand(400, 3, AREA, AREA)
+    cells = torch.full((400,), 112)
+    ensemble.loss(floor, cells, torch.ones(400), generator())
+    assert torch.equal(seen[0][201::2], floor[201::2, :, 7 : 7 + PATCH, 7 : 7 + PATCH])
+    patches = seen[0][::2]
+    middle = patches[:, :, MARGIN, MARGIN]
+    assert len({tuple(order) for order in middle.argsort(dim=1).tolist()}) == 6
+    assert (middle.std(dim=0) > 0.3).all()
+    assert (patches.abs() <= 1).all()
+    rising = patches[100:, :, 0, -1] > patches[100:, :, 0, 0]
+    assert rising[middle[100:].abs() < 0.9].all()
+    ensemble.loss(floor, cells, torch.ones(400), generator())
+    assert torch.equal(seen[1], seen[0]), "the same noise gives the same colours"
 
 
 def test_gradient_of_the_loss_agrees_with_finite_differences(make_ensemble) -> None:

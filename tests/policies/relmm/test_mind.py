@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from relmm.features import DRIVE_PULSE_S, MAX_THETA_VEL, MAX_X_VEL, Skill
+from relmm.policies.relmm.driving import STEP_LENGTH, STEP_TURN
 from relmm.policies.relmm.memory import FloorGrid, FloorMemory
 from relmm.policies.relmm.mind import Mind
-from relmm.policies.relmm.planning import STEP_LENGTH, STEP_TURN, Plan, Planner
+from relmm.policies.relmm.planning import Plan, Planner
 
 
 class Notes(Planner):
