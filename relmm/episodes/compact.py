@@ -13,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from relmm.episodes.folder import INFO, RELMM, TASKS, DatasetFolder
+from relmm.episodes.folder import INFO, RELMM, TASKS, DatasetFolder, refuse_links
 from relmm.episodes.repair import verify_and_repair
 from relmm.episodes.settings import DATA_PATH
 from relmm.episodes.survey import Survey, survey
@@ -33,13 +33,14 @@ def compact(root: Path | str, target: Path) -> int:
         How many episodes the copy holds.
 
     Raises:
-        DatasetError: there is no dataset, or no whole episode in it.
+        DatasetError: there is no dataset, it has links, or no whole episode in it.
         OSError: the copy cannot be written.
     """
     folder = DatasetFolder(root)
     info = folder.read_json(INFO)
     if info is None:
         raise DatasetError(f"{root} is no LeRobot dataset, it has no readable {INFO}; check the folder.")
+    refuse_links(folder.root)
     found = survey(folder, info["data_path"])
     if not found.episodes:
         raise DatasetError(f"{root} has no whole episode yet; record one first.")

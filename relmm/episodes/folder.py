@@ -35,6 +35,22 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def refuse_links(root: Path) -> None:
+    """See that a folder holds its files itself: what a link leads to must not be deleted, changed or uploaded.
+
+    Raises:
+        DatasetError: with the first link in it.
+    """
+    for folder, folders, files in os.walk(root):
+        for name in sorted((*folders, *files)):
+            path = Path(folder) / name
+            if path.is_symlink():
+                raise DatasetError(
+                    f"{path} is a link to {os.readlink(path)}, and what links lead to is neither changed nor uploaded; "
+                    "put a copy in its place, or remove it."
+                )
+
+
 class DatasetFolder:
     """Paths of one dataset, and the few operations on them that must be atomic.
 
@@ -56,8 +72,9 @@ class DatasetFolder:
         """Become the only writer of this dataset; the lock of a killed process is free again.
 
         Raises:
-            DatasetError: another writer has it open.
+            DatasetError: another writer has it open, or it has links.
         """
+        refuse_links(self.root)
         self.scratch.mkdir(exist_ok=True)
         try:
             self._lock.acquire()

@@ -24,6 +24,7 @@ from relmm.learning.actor import Actor
 from relmm.policies.learning import Learner
 
 _MODEL, _STATE, _LAST = "pretrained_model", "training_state", "last"
+STEP = "training_step.json"  # LeRobot's
 _COUNTERS, _RANDOM = "relmm_state.json", "relmm_rng.safetensors"
 
 
@@ -44,14 +45,15 @@ def save_checkpoint(
     Returns:
         The checkpoint's folder.
     """
-    from lerobot.common.train_utils import save_training_state
+    from lerobot.optim import save_optimizer_state
 
     target, temporary = folder / f"{step:06d}", folder / f".{step:06d}.tmp"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     actor.save_pretrained(temporary / _MODEL)
     _write_json(temporary / _MODEL / "train_config.json", config)
-    save_training_state(temporary, step, learner.optimizers)
+    save_optimizer_state(learner.optimizers, temporary / _STATE)
+    _write_json(temporary / _STATE / STEP, {"step": step})
     states = {"trainer": rng.bit_generator.state, "learner": learner.rng.bit_generator.state}
     _write_json(temporary / _STATE / _COUNTERS, {"counters": counters, "random": states})
     save_file({"noise": learner.noise.get_state()}, temporary / _STATE / _RANDOM)

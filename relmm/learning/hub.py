@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from relmm.episodes import UploadedDataset, check_repo_id
+from relmm.episodes.folder import refuse_links
 from relmm.episodes.remote import download, push_folder, reason
 from relmm.episodes.upload import refuse_other_runs, runs_of
 from relmm.errors import ConfigError, HubError
-from relmm.learning.checkpoint import portable_config, pretrained_model, training_state
+from relmm.learning.checkpoint import STEP, portable_config, pretrained_model, training_state
 from relmm.learning.progress import Progress, read_metrics
 from relmm.learning.untrusted import CONFIG, WEIGHTS, check_policy_folder, read_json
 
@@ -81,11 +82,13 @@ def upload_checkpoint(
 
     Raises:
         ConfigError: the Hub would refuse the name, or the checkpoint is damaged, or of relmm 0.1.0.
+        DatasetError: the checkpoint has links in it.
         HubError: the upload has failed, or the repository holds another run.
     """
     check_repo_id(repo_id)
+    refuse_links(checkpoint)
     check_policy_folder(pretrained_model(checkpoint))
-    step = read_json(training_state(checkpoint) / "training_step.json")["step"]
+    step = read_json(training_state(checkpoint) / STEP)["step"]
     source = Source(step, None, None, 0, runs)
     if dataset is not None:
         source = replace(source, repo_id=dataset.repo_id, revision=dataset.revision, episodes=dataset.episodes)

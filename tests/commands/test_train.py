@@ -53,7 +53,7 @@ def test_run_leaves_lerobots_tree(finished):
     model = {path.name for path in (last / "pretrained_model").iterdir()}
     assert {"config.json", "model.safetensors", "train_config.json", "policy_preprocessor.json"} <= model
     state = {path.name for path in (last / "training_state").iterdir()}
-    assert {"grasping", "training_step.json", "rng_state.safetensors", "relmm_state.json"} <= state
+    assert {"grasping", "training_step.json", "relmm_state.json", "relmm_rng.safetensors"} <= state
 
 
 def test_dataset_holds_the_whole_life(finished):
