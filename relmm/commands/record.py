@@ -15,7 +15,14 @@ from relmm.commands.policies import FreshWeights, make_actor, policy_from_path, 
 from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
-from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, saved_episodes, summarize
+from relmm.episodes import (
+    EpisodeRecorder,
+    check_new,
+    check_repo_id,
+    check_resume,
+    summarize,
+    verify_and_repair,
+)
 from relmm.errors import ConfigError
 from relmm.learning.actor import Actor
 from relmm.learning.collect import Collector
@@ -97,12 +104,19 @@ class RecordConfig:
 def record(config: RecordConfig) -> None:
     """Record `num_episodes` episodes, and say what the dataset then holds."""
     root = config.dataset.folder()
-    if not config.resume:
+    saved = 0
+    if config.resume:
+        check_resume(root, config.dataset.repo_id, depth=None, robot_type=None, info=None)
+        report = verify_and_repair(root)
+        saved = report.episodes
+        if report.problems:
+            print(report)
+    else:
         check_new(root, config.dataset.repo_id)
     if config.dataset.push_to_hub:
         check_dataset_upload(config.dataset.repo_id, config.dataset.private, config.resume)
     # A resumed recording goes on with other random numbers than it began with.
-    seed = config.seed + (saved_episodes(root) if config.resume else 0)
+    seed = config.seed + saved
     take_seed(config.policy, seed)
     assert config.policy is not None
     actor = make_actor(config.policy)
@@ -144,8 +158,6 @@ def _collect(
     seed: int,
     signals: StopOnSignal,
 ) -> None:
-    if recorder.repaired:
-        print(recorder.repaired)
     life = Life(robot, [recorder], robot.seconds, config.max_steps, should_stop=lambda: signals.stopped)
     collector = Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
     assert config.policy is not None

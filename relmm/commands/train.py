@@ -22,6 +22,7 @@ from relmm.commands.sharing import Uploads, check_uploads, run_arguments
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
 from relmm.episodes import (
+    Episode,
     EpisodeFollower,
     EpisodeRecorder,
     check_new,
@@ -30,12 +31,17 @@ from relmm.episodes import (
     read_episodes,
     saved_episodes,
     summarize,
+    verify_and_repair,
 )
+from relmm.episodes.folder import DatasetFolder
+from relmm.episodes.upload import recorded_runs, runs_of
+from relmm.errors import ConfigError
 from relmm.learning.checkpoint import (
     check_same_networks,
     last_checkpoint,
     load_training_state,
     pretrained_model,
+    read_training_state,
     save_checkpoint,
 )
 from relmm.learning.life import Life
@@ -63,7 +69,7 @@ class Run:
     def __init__(self, config: TrainConfig, signals: StopOnSignal) -> None:
         assert isinstance(config.policy, LearningConfig)
         self.config, self.signals = config, signals
-        self.saved_config = draccus.encode(config)  # as it was given, for a resume
+        self.saved_config = _settings_to_keep(config)
         self.checkpoint = last_checkpoint(config.checkpoints) if config.resume else None
         if self.checkpoint is not None:
             check_same_networks(self.checkpoint, config.policy.fingerprint())
@@ -77,33 +83,56 @@ class Run:
         self.learner = policy.make_learner(config.seed, config.replay_frames)
         self.rng = np.random.default_rng([config.seed, _TRAINER_STREAM])
         self.progress = Progress()
+        self.learned = 0  # episodes of the run's dataset that the checkpoint has learned from
+        if self.checkpoint is not None:
+            counters = load_training_state(self.checkpoint, self.learner, self.rng)
+            self.learned, self.progress.interventions = counters["episodes"], counters["interventions"]
         assert config.output_dir is not None
         self.uploads = Uploads(run_arguments(config), config.output_dir)
 
-    def load_data(self) -> None:
-        """Fill the replay: with the dataset to start from, then with the run's own, and learn what is new in them."""
-        cursor = -1
-        if self.checkpoint is not None:
-            counters = load_training_state(self.checkpoint, self.learner, self.rng)
-            cursor, self.progress.interventions = counters["episodes"], counters["interventions"]
+    @property
+    def data(self) -> Path:
+        """The folder of the dataset that the run learns from."""
+        return self.config.dataset.follow or self.config.dataset_root
+
+    def check_cursor(self, episodes: int) -> None:
+        """Refuse to go on without the data that the checkpoint has learned from.
+
+        Args:
+            episodes: that the run's dataset has.
+
+        Raises:
+            ConfigError: it has fewer, or those of another run.
+        """
+        if self.checkpoint is None:
+            return
+        what = f"the checkpoint {self.checkpoint} has learned from {self.learned} episodes"
+        advice = f"bring them back, or begin a new run with --policy.path={pretrained_model(self.checkpoint)}"
+        if episodes < self.learned:
+            raise ConfigError(f"{what}, and its dataset {self.data} has {episodes}: {advice}.")
+        runs = runs_of(read_training_state(self.checkpoint))
+        if self.learned and recorded_runs(DatasetFolder(self.data))[: len(runs)] != runs:
+            raise ConfigError(f"{what} of another recording than {self.data}: {advice}.")
+
+    def read_initial_data(self) -> None:
+        """Fill the replay with the dataset to start from, and learn what is new in it."""
         if self.config.dataset.init is not None:
             root = local_root(self.config.dataset.init)
             check_trainable(root, self.policy.config.camera)
-            self._read(root, "reading the initial dataset", update_from=0 if self.checkpoint is None else None)
-        if self.checkpoint is not None:
-            root = self.config.dataset.follow or self.config.dataset_root
-            if root.exists():
-                check_trainable(root, self.policy.config.camera)
-                self._read(root, "reading the run's own dataset", update_from=cursor, count=True)
-
-    def _read(self, root: Path, title: str, update_from: int | None, count: bool = False) -> None:
-        with progress(saved_episodes(root), "episode", title, leave=False) as bar:
-            for episode in read_episodes(root):
-                update = update_from is not None and episode.index >= update_from
+            update = self.checkpoint is None
+            for episode in _with_bar(root, "reading the initial dataset"):
                 self.learner.read(episode, update)
-                if count:
-                    self.progress.read(episode)
-                bar.update()
+
+    def read_own_data(self) -> int:
+        """Fill the replay with the run's own dataset, and learn what the checkpoint has not; how many episodes."""
+        episodes = 0
+        if self.checkpoint is not None and self.data.exists():
+            check_trainable(self.data, self.policy.config.camera)
+            for episode in _with_bar(self.data, "reading the run's own dataset"):
+                self.learner.read(episode, update=episode.index >= self.learned)
+                self.progress.read(episode)
+                episodes = episode.index + 1
+        return episodes
 
     def save(self, episodes: int) -> None:
         """Write a checkpoint.
@@ -120,6 +149,7 @@ class Run:
             self.rng,
             counters,
             self.saved_config,
+            recorded_runs(DatasetFolder(self.data)),
         )
 
     def bar(self, title: str) -> Any:
@@ -161,6 +191,24 @@ class Run:
         )
 
 
+def _settings_to_keep(config: TrainConfig) -> dict[str, Any]:
+    """For a resume, which may come from another folder: as given, but with whole paths."""
+    settings: dict[str, Any] = draccus.encode(config)
+    dataset = settings["dataset"]
+    for name in ("root", "follow", "init"):
+        # What does not exist yet is a folder, too, but for `init`: that may be a name on the Hub.
+        if dataset[name] is not None and (name != "init" or Path(dataset[name]).exists()):
+            dataset[name] = str(Path(dataset[name]).absolute())
+    return settings
+
+
+def _with_bar(root: Path, title: str) -> Iterator[Episode]:
+    with progress(saved_episodes(root), "episode", title, leave=False) as bar:
+        for episode in read_episodes(root):
+            yield episode
+            bar.update()
+
+
 def train(config: TrainConfig) -> None:
     """Train, and say where everything is."""
     import torch
@@ -184,16 +232,16 @@ def train(config: TrainConfig) -> None:
 def _train_on_robot(run: Run) -> None:
     config = run.config
     assert config.robot is not None
-    if not config.resume:
-        check_new(config.dataset_root, config.dataset.repo_id)
-    run.load_data()
-    seed = config.seed + (saved_episodes(config.dataset_root) if config.resume else 0)
+    saved, damaged = _own_dataset(run)
+    run.read_initial_data()
+    seed = config.seed + saved
     robot = make_locobot(replace(config.robot), seed, "relmm-train")
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         with _recorder(run, robot, seed) as recorder:
-            if recorder.repaired:
-                print(recorder.repaired)
+            run.read_own_data()  # now that nobody else writes to it
+            if damaged:
+                run.save(recorder.saved_episodes)
             life = Life(
                 robot,
                 [recorder, run.learner, run.progress],
@@ -213,6 +261,7 @@ def _train_on_robot(run: Run) -> None:
             )
 
             def save() -> None:
+                life.cut_episode()
                 recorder.flush()
                 run.save(recorder.saved_episodes)
 
@@ -220,6 +269,22 @@ def _train_on_robot(run: Run) -> None:
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
     if recorder.saved_episodes > 0:
         print(summarize(config.dataset_root))
+
+
+def _own_dataset(run: Run) -> tuple[int, bool]:
+    """See that the run's dataset is there, and repair it; its episodes, and whether any were lost."""
+    config = run.config
+    root = config.dataset_root
+    if not config.resume:
+        check_new(root, config.dataset.repo_id)
+        return 0, False
+    report = verify_and_repair(root) if root.exists() else None
+    episodes, damaged = (report.episodes, bool(report.problems)) if report is not None else (0, False)
+    if damaged:
+        print(report)
+        run.learned = min(run.learned, episodes)
+    run.check_cursor(episodes)
+    return episodes, damaged
 
 
 def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:
@@ -260,11 +325,11 @@ def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
 
 
 def _train_on_stream(run: Run, root: Path) -> None:
-    config = run.config
-    run.load_data()
-    follower = EpisodeFollower(root, saved_episodes(root) if config.resume else 0, run.policy.config.camera)
+    run.check_cursor(saved_episodes(root))
+    run.read_initial_data()
+    follower = EpisodeFollower(root, run.read_own_data(), run.policy.config.camera)
 
-    def episodes() -> Iterator[Any]:
+    def episodes() -> Iterator[Episode]:
         while not run.signals.stopped:
             before = follower.next
             for episode in follower.read_new():

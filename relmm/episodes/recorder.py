@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import multiprocessing
 import queue
 import select
 import signal
 import threading
+import time
 from collections.abc import Mapping
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -23,6 +26,9 @@ from relmm.episodes.process import IGNORED_SIGNALS, Reply, WriterSettings, write
 from relmm.episodes.settings import check_new, check_resume
 from relmm.errors import DatasetError, RelmmError
 
+logger = logging.getLogger(__name__)
+
+PATIENCE_S = 2.0  # after which a user is told what is waited for
 POLL_S = 0.2  # how often a waiting caller looks whether the writer is still alive
 # Frames handed over at once: waking two threads and a process for each would cost the loop more than the frame itself.
 BATCH_FRAMES = 16
@@ -37,7 +43,7 @@ class EpisodeRecorder:
     spawned process.
 
     Attributes:
-        save_unfinished: whether `close` also saves the frames since the last saved episode.
+        save_unfinished: whether `close` also saves the frames since the last saved episode, as one that was cut off.
         repaired: what had to be repaired on resuming, in words; empty when nothing.
     """
 
@@ -117,8 +123,8 @@ class EpisodeRecorder:
         self._check()
         self._batch.append((self._build_frame(observation, action, outcome), task))
         self._frames += 1
-        if len(self._batch) == self._batch_frames:
-            self._hand_over()
+        if len(self._batch) > self._batch_frames:  # the last frame stays here, for `cut_episode`
+            self._hand_over(self._batch_frames)
 
     def save_episode(self) -> None:
         """Ask for the episode to be saved; `flush` waits until it is.
@@ -129,10 +135,22 @@ class EpisodeRecorder:
         self._check()
         if not self._frames:
             raise DatasetError("an episode without frames cannot be saved; add a frame first.")
-        self._hand_over()
+        self._hand_over(len(self._batch))
         self._put(("save",))
         self._asked += 1
         self._frames = 0
+
+    def cut_episode(self) -> None:
+        """Save the frames since the last saved episode, if there are any, as an episode that was cut off.
+
+        Raises:
+            DatasetError: the writer has failed.
+        """
+        if self._frames:
+            frame, _ = self._batch[-1]
+            if not frame["next.done"]:
+                frame["next.truncated"][:] = True
+            self.save_episode()
 
     def discard_episode(self) -> None:
         """Forget the frames since the last saved episode."""
@@ -159,12 +177,16 @@ class EpisodeRecorder:
         """
         if self._closed:
             return
-        if self.save_unfinished and self._frames and self._error is None:
-            self.save_episode()
+        if self.save_unfinished and self._error is None:
+            self.cut_episode()
         self._closed = True
         self._finish()
+        said, started = False, time.monotonic()
         while self._error is None and not self._process_has_ended():
             self._read_replies(POLL_S)
+            if not said and time.monotonic() - started > PATIENCE_S:
+                said = True
+                logger.info("saving the last episodes of %s", self._root)
         self._process.join()
         if self._error is not None and not self._error_was_raised:
             self._raise_error()
@@ -185,6 +207,7 @@ class EpisodeRecorder:
         self._process = spawn.Process(
             target=write_episodes, args=(commands_out, replies_in, settings), name="relmm-writer", daemon=False
         )
+        resource_tracker.ensure_running()  # or it is started by the process below, and undoes the mask
         # Masked signals stay masked in a new process: it may not die of a Ctrl-C before it can ignore them.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, IGNORED_SIGNALS)
         self._process.start()
@@ -199,9 +222,9 @@ class EpisodeRecorder:
         # Also when the interpreter ends without `close`: multiprocessing then waits for the writer, which waits for us.
         self._finish = Finalize(self, _end_feeding, args=(self._queue, feeder), exitpriority=10)
 
-    def _hand_over(self) -> None:
+    def _hand_over(self, count: int) -> None:
         if self._batch:
-            batch, self._batch = self._batch, []
+            batch, self._batch = self._batch[:count], self._batch[count:]
             self._put(("frames", batch))
 
     def _put(self, message: tuple[Any, ...]) -> None:

@@ -11,7 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from relmm.episodes.folder import DATA_FILES, DatasetFolder
+from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, DatasetFolder
+from relmm.episodes.survey import read_places
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, FPS, Phase, Skill
 
@@ -96,8 +97,10 @@ def summarize(root: Path | str) -> DatasetSummary:
 
 
 def saved_episodes(root: Path | str) -> int:
-    """How many episodes a dataset has; none if its recording ended before the first was saved."""
-    return summarize(root).episodes if DatasetFolder(root).files(DATA_FILES) else 0
+    """How many episodes a dataset lists, also while it is being recorded; those in damaged files do not count."""
+    folder = DatasetFolder(root)
+    tables = (read_places(folder.root / name) for name in folder.files(EPISODE_FILES))
+    return sum(len(table) for table in tables if table is not None)
 
 
 def _read(folder: DatasetFolder, files: list[str]) -> dict[str, NDArray[Any]]:

@@ -29,7 +29,14 @@ _COUNTERS, _RANDOM = "relmm_state.json", "relmm_rng.safetensors"
 
 
 def save_checkpoint(
-    folder: Path, step: int, actor: Actor, learner: Learner, rng: Any, counters: dict[str, Any], config: dict[str, Any]
+    folder: Path,
+    step: int,
+    actor: Actor,
+    learner: Learner,
+    rng: Any,
+    counters: dict[str, Any],
+    config: dict[str, Any],
+    runs: list[dict[str, Any]],
 ) -> Path:
     """Write `folder/<step>` and point `folder/last` to it.
 
@@ -41,6 +48,7 @@ def save_checkpoint(
         rng: the trainer's numpy generator.
         counters: of the run; JSON values.
         config: of the run, for `train_config.json`.
+        runs: with what the run's dataset was recorded; see `relmm.episodes.upload.recorded_runs`.
 
     Returns:
         The checkpoint's folder.
@@ -55,7 +63,7 @@ def save_checkpoint(
     save_optimizer_state(learner.optimizers, temporary / _STATE)
     _write_json(temporary / _STATE / STEP, {"step": step})
     states = {"trainer": rng.bit_generator.state, "learner": learner.rng.bit_generator.state}
-    _write_json(temporary / _STATE / _COUNTERS, {"counters": counters, "random": states})
+    _write_json(temporary / _STATE / _COUNTERS, {"counters": counters, "random": states, "runs": runs})
     save_file({"noise": learner.noise.get_state()}, temporary / _STATE / _RANDOM)
     _sync_tree(temporary)
     if target.exists():  # the same step again: the link must never point to what is being removed
@@ -141,6 +149,12 @@ def install_checkpoint(folder: Path, step: int, model: Path, names: list[str]) -
     _link(folder / _LAST, target.name)
 
 
+def read_training_state(checkpoint: Path) -> dict[str, Any]:
+    """Counters, random states, and with what the dataset was recorded, as `save_checkpoint` wrote them."""
+    state: dict[str, Any] = json.loads((checkpoint / _STATE / _COUNTERS).read_text(encoding="utf-8"))
+    return state
+
+
 def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[str, Any]:
     """Restore what `save_checkpoint` wrote, but for the weights, and give back the counters.
 
@@ -152,7 +166,7 @@ def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[st
     try:
         load_optimizer_state(learner.optimizers, checkpoint / _STATE)
         _check_optimizers(learner)
-        state = json.loads((checkpoint / _STATE / _COUNTERS).read_text(encoding="utf-8"))
+        state = read_training_state(checkpoint)
         learner.noise.set_state(load_file(checkpoint / _STATE / _RANDOM)["noise"])
         rng.bit_generator.state = state["random"]["trainer"]
         learner.rng.bit_generator.state = state["random"]["learner"]

@@ -1,7 +1,7 @@
 """A robot's life, frame by frame: act, look, judge, and hand the frame to whoever keeps it.
 
-An episode begins with the pseudo-reset after the last success, if there was one, and ends with a success or at a step
-limit. So its last frame is the only one that is done or truncated.
+An episode begins with the pseudo-reset after the last success, if there was one, and ends with a success, at a step
+limit, or with a checkpoint. Its last frame is the only one that is done or truncated.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ class Recorder(Protocol):
 
     def save_episode(self) -> None:
         """End the episode."""
+
+    def cut_episode(self) -> None:
+        """End it before it is done."""
 
 
 @dataclass
@@ -123,8 +126,17 @@ class Life:
         for recorder in self._recorders:
             recorder.add_frame(before, done_action, outcome, TASK)
         if success or truncated:
-            self._end_episode(success)
+            for recorder in self._recorders:
+                recorder.save_episode()
+            self._begin_episode(success)
         return success or truncated
+
+    def cut_episode(self) -> None:
+        """End the episode here, if it has any frames: what is recorded and learned then ends with the same one."""
+        if self.episode.frames:
+            for recorder in self._recorders:
+                recorder.cut_episode()
+            self._begin_episode(success=False)
 
     def _count(self, grasped: bool, phase: Phase) -> None:
         self._grasps_in_a_row = self._grasps_in_a_row + 1 if grasped else 0
@@ -133,9 +145,7 @@ class Life:
         self.episode.grasps += grasped
         self.episode.steps += counts
 
-    def _end_episode(self, success: bool) -> None:
-        for recorder in self._recorders:
-            recorder.save_episode()
+    def _begin_episode(self, success: bool) -> None:
         self.episode.success = success
         self.last_episode, self.episode = self.episode, EpisodeResult()
         self._grasps_in_a_row = 0

@@ -68,6 +68,9 @@ class Progress:
     def save_episode(self) -> None:
         """Nothing to do."""
 
+    def cut_episode(self) -> None:
+        """Nothing to do."""
+
     def asdict(self) -> dict[str, float]:
         """By name, for logs."""
         return asdict(self)

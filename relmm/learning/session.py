@@ -40,7 +40,7 @@ class Session:
         learner: whose losses are logged.
         metrics: takes them.
         save: writes a checkpoint.
-        evaluate: the scores of the policy as it is.
+        evaluate: the scores of the policy as it is, none if there is nothing to evaluate or it was stopped.
         show: tells the user, after every attempt and step.
         upload: begins to upload the newest checkpoint, without waiting.
     """
@@ -95,11 +95,11 @@ class Session:
         self._show(self._status())
         if _passed(before, step, schedule.log_freq):
             self._metrics.write(**self._status(), **self._learner.logs)
-        if _passed(before, step, schedule.eval_freq):
-            self._metrics.write(**self._status(), **self._evaluate())
-        upload = _passed(before, step, schedule.upload_freq)
-        if save or upload or _passed(before, step, schedule.save_freq):
-            self._checkpoint()
+        evaluate, upload = (_passed(before, step, every) for every in (schedule.eval_freq, schedule.upload_freq))
+        if save or evaluate or upload or _passed(before, step, schedule.save_freq):
+            self._checkpoint()  # before the evaluation, which takes long and may be stopped
+        if evaluate and (scores := self._evaluate()):
+            self._metrics.write(**self._status(), **scores)
         if upload:
             self._upload()
 

@@ -135,6 +135,10 @@ class Learner(ABC):
     def save_episode(self) -> None:
         """End the episode: what comes next need not follow on."""
 
+    def cut_episode(self) -> None:
+        """End it before it is done."""
+        self.save_episode()
+
     @abstractmethod
     def update_grasping(self, phase: int) -> None:
         """The updates that follow an attempt in a phase, if there are enough attempts to learn from."""

@@ -124,7 +124,7 @@ def published_run(hub, tmp_path) -> None:
     learner = actor.policy.make_learner(seed=0, capacity=1000)
     settings = {"policy": {"type": "relmm"}, "dataset": {"repo_id": "me/life"}}
     counters = {"episodes": 10, "interventions": 0}
-    saved = save_checkpoint(tmp_path / "saved", 7, actor, learner, np.random.default_rng(0), counters, settings)
+    saved = save_checkpoint(tmp_path / "saved", 7, actor, learner, np.random.default_rng(0), counters, settings, [])
     runs = recorded_runs(DatasetFolder(SAMPLE))
     upload_checkpoint(saved, "me/policy", private=None, dataset=dataset, runs=runs, decorate=lambda folder: None)
 

@@ -3,13 +3,16 @@
 import os
 import resource
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from episode_helpers import INFO, REPO_ID, TASK, action, arguments, check_dataset, length_of, load, new_dataset
 
-from relmm.episodes import EpisodeRecorder, summarize
+from relmm.episodes import EpisodeRecorder, read_episodes, summarize
 from relmm.episodes.recorder import BATCH_FRAMES
 from relmm.errors import ConfigError, DatasetError
 
@@ -132,3 +135,41 @@ def test_summary_counts_what_is_on_disk(tmp_path):
         summarize(tmp_path / "d")
     with pytest.raises(DatasetError, match="no episodes"):
         summarize(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("frames", [1, BATCH_FRAMES - 1, BATCH_FRAMES, BATCH_FRAMES + 1, 2 * BATCH_FRAMES])
+def test_an_episode_that_is_cut_off_ends_truncated(frames, tmp_path):
+    with EpisodeRecorder(tmp_path / "d", REPO_ID, resume=False, save_unfinished=True, **SETTINGS) as recorder:
+        add_episode(recorder, 60, steps=frames)
+        recorder.cut_episode()
+        recorder.cut_episode()  # of which there are no frames: nothing
+        add_episode(recorder, 60, steps=frames)
+    episodes = list(read_episodes(tmp_path / "d"))
+    assert [len(episode) for episode in episodes] == [frames] * 2
+    for episode in episodes:
+        assert episode.truncated.tolist() == [False] * (frames - 1) + [True]
+
+
+SURVIVE = """
+import signal, sys
+sys.path.insert(0, {folder!r})
+from episode_helpers import INFO, REPO_ID, TASK, arguments
+from relmm.episodes import EpisodeRecorder
+if __name__ == "__main__":
+    start = __import__("multiprocessing").context.SpawnProcess.start
+    def interrupted(process):
+        start(process)
+        __import__("os").kill(process.pid, signal.SIGTERM)  # long before it can ignore anything
+    __import__("multiprocessing").context.SpawnProcess.start = interrupted
+    with EpisodeRecorder({root!r}, REPO_ID, resume=False, depth=False, robot_type="locobot_sim", info=INFO) as recorder:
+        recorder.add_frame(*arguments(0, 0), TASK)
+        recorder.save_episode()
+"""
+
+
+def test_the_first_writer_of_a_process_does_not_die_of_a_signal_before_it_can_ignore_it(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SURVIVE.format(folder=str(Path(__file__).parent), root=str(tmp_path / "d")))
+    result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=200)
+    assert result.returncode == 0, result.stderr
+    assert summarize(tmp_path / "d").episodes == 1

@@ -67,7 +67,7 @@ def test_restored_learner_goes_on_as_if_nothing_had_happened(tmp_path, kind):
     actor, learner = make_learner(kind)
     rng = np.random.default_rng(5)
     work(learner, 2)
-    save_checkpoint(tmp_path, 7, actor, learner, rng, {"episodes": 3}, {"steps": 10})
+    save_checkpoint(tmp_path, 7, actor, learner, rng, {"episodes": 3}, {"steps": 10}, [])
     work(learner, 2)
     wanted = [rng.random(), learner.rng.random(), float(torch.rand(1, generator=learner.noise))]
 
@@ -88,7 +88,7 @@ def test_restored_learner_goes_on_as_if_nothing_had_happened(tmp_path, kind):
 def test_crash_between_the_renames_leaves_the_last_checkpoint(tmp_path, monkeypatch, crash_at):
     actor, learner = make_learner()
     rng = np.random.default_rng(0)
-    save_checkpoint(tmp_path, 1, actor, learner, rng, {"episodes": 1}, {})
+    save_checkpoint(tmp_path, 1, actor, learner, rng, {"episodes": 1}, {}, [])
     replace, calls = os.replace, []
 
     def dying(*arguments):
@@ -99,11 +99,11 @@ def test_crash_between_the_renames_leaves_the_last_checkpoint(tmp_path, monkeypa
 
     monkeypatch.setattr(module.os, "replace", dying)
     with pytest.raises(KeyboardInterrupt):
-        save_checkpoint(tmp_path, 2, actor, learner, rng, {"episodes": 2}, {})
+        save_checkpoint(tmp_path, 2, actor, learner, rng, {"episodes": 2}, {}, [])
     monkeypatch.undo()
     assert last_checkpoint(tmp_path).name == "000001"
     assert load_training_state(last_checkpoint(tmp_path), learner, rng) == {"episodes": 1}
-    save_checkpoint(tmp_path, 2, actor, learner, rng, {"episodes": 2}, {})
+    save_checkpoint(tmp_path, 2, actor, learner, rng, {"episodes": 2}, {}, [])
     assert last_checkpoint(tmp_path).name == "000002"
 
 
@@ -117,7 +117,8 @@ actor, learner = make_learner()
 step = 0
 while True:
     step += 1
-    save_checkpoint(Path({target!r}), step % 3, actor, learner, np.random.default_rng(0), {{"episodes": step}}, {{}})
+    counters = {{"episodes": step}}
+    save_checkpoint(Path({target!r}), step % 3, actor, learner, np.random.default_rng(0), counters, {{}}, [])
     print(step, flush=True)
 """
 
@@ -142,7 +143,7 @@ def test_killed_while_saving_leaves_a_whole_checkpoint(tmp_path):
 @pytest.mark.parametrize("kind", ["relmm", "relmm_paper"])
 def test_checkpoint_of_other_networks_is_refused(tmp_path, kind):
     actor, learner = make_learner(kind)
-    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {}, {})
+    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {}, {}, [])
     check_same_networks(folder, make_config(kind).fingerprint())
     with pytest.raises(ConfigError, match="num_members is 2, not 3"):
         check_same_networks(folder, make_config(kind, num_members=3).fingerprint())
@@ -152,7 +153,7 @@ def test_checkpoint_of_other_networks_is_refused(tmp_path, kind):
 
 def test_damaged_training_state_is_one_sentence(tmp_path):
     actor, learner = make_learner()
-    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {}, {})
+    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {}, {}, [])
     (folder / "training_state" / "relmm_state.json").write_text("{", encoding="utf-8")
     with pytest.raises(ConfigError, match="resume another"):
         load_training_state(folder, learner, np.random.default_rng(0))

@@ -46,7 +46,7 @@ def save_step(tmp_path):
     def save(step: int):
         counters = {"episodes": 3, "interventions": 1}
         return save_checkpoint(
-            tmp_path / "checkpoints", step, actor, learner, np.random.default_rng(5), counters, SETTINGS
+            tmp_path / "checkpoints", step, actor, learner, np.random.default_rng(5), counters, SETTINGS, RUNS
         )
 
     return save
