@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from relmm.errors import ConfigError, RobotError
-from relmm.features import IMAGE_SIZE, FloatArray
+from relmm.features import IMAGE_KEY, IMAGE_SIZE, FloatArray
 
 
 def moved(pose: FloatArray, motion: FloatArray) -> FloatArray:
@@ -187,3 +187,25 @@ def camera_info(name: str) -> dict[str, Any]:
     """
     camera = camera_geometry(name)
     return {"name": name, "position": list(camera.position), "pitch": camera.pitch, "fov": list(camera.fov)}
+
+
+def other_camera(features: dict[str, Any], wanted: str | None) -> tuple[str, str] | None:
+    """The camera of a dataset and the wanted one, in words, if both are known and differ.
+
+    Args:
+        features: of the dataset, as LeRobot stores them.
+        wanted: its name, None for any.
+    """
+    feature = features.get(IMAGE_KEY)
+    info = feature.get("info") if isinstance(feature, dict) else None
+    have = info.get("camera") if isinstance(info, dict) else None
+    want = None if wanted is None else camera_info(wanted)
+    return None if None in (have, want) or have == want else (describe_camera(have), describe_camera(want))
+
+
+def describe_camera(camera: Any) -> str:
+    """The camera of a picture's `info` in words."""
+    if not isinstance(camera, dict):
+        return repr(camera)
+    details = ", ".join(f"{key} {value}" for key, value in camera.items() if key != "name")
+    return f"{camera.get('name')} ({details})"

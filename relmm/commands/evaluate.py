@@ -15,7 +15,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from relmm.commands.cli import dated_folder, progress, run
-from relmm.commands.policies import make_actor, policy_from_path, take_seed
+from relmm.commands.policies import check_camera, make_actor, policy_from_path, take_seed
 from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES
 from relmm.learning.actor import Actor
@@ -75,6 +75,7 @@ class EvalConfig:
         self.policy = policy_from_path(self.policy)
         if not isinstance(self.env, RelmmRoomEnvConfig):
             raise ConfigError(f"relmm-eval needs --env.type=relmm_room, not {self.env.type}.")
+        check_camera(self.policy, "env.camera", self.env)
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}, but must not be negative.")
         if self.output_dir is None:

@@ -50,6 +50,26 @@ def _forget_owner(policy: PreTrainedConfig, overrides: list[str]) -> None:
             setattr(policy, name, value)
 
 
+def check_camera(policy: PreTrainedConfig, option: str, seen_through: Any) -> None:
+    """Refuse a policy that takes the pictures for those of another camera.
+
+    Args:
+        policy: its config.
+        option: that the camera is named by.
+        seen_through: config of a robot or room.
+
+    Raises:
+        ConfigError: with both cameras.
+    """
+    camera = getattr(seen_through, "camera", None)
+    expected = getattr(policy, "camera", camera)
+    if None not in (camera, expected) and camera != expected:
+        raise ConfigError(
+            f"{option} is {camera!r} but policy.camera is {expected!r}: the policy must know the camera that it sees "
+            f"through; say --{option}={expected}, or --policy.camera={camera} if it has not learned with another."
+        )
+
+
 class FreshWeights:
     """Lets an actor take over the weights of newer checkpoints, while another process trains.
 

@@ -11,7 +11,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, now, progress, run
-from relmm.commands.policies import FreshWeights, make_actor, policy_from_path, take_seed
+from relmm.commands.policies import FreshWeights, check_camera, make_actor, policy_from_path, take_seed
 from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
@@ -88,6 +88,7 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         self.policy = policy_from_path(self.policy)
+        check_camera(self.policy, "robot.camera", self.robot)
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}, but must not be negative.")
         if self.max_steps < 1:

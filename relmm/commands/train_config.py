@@ -10,7 +10,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import dated_folder
-from relmm.commands.policies import policy_from_path
+from relmm.commands.policies import check_camera, policy_from_path
 from relmm.commands.upload import LICENSE
 from relmm.episodes import check_repo_id
 from relmm.errors import ConfigError
@@ -170,12 +170,7 @@ class TrainConfig:
                 "Say what to learn from: either a robot (--robot.type=locobot_sim) or a dataset that another process "
                 "records (--dataset.follow=FOLDER), not both."
             )
-        camera = getattr(self.robot, "camera", self.policy.camera)
-        if camera != self.policy.camera:
-            raise ConfigError(
-                f"robot.camera is {camera!r} but policy.camera is {self.policy.camera!r}: the policy must know the "
-                f"robot's camera; add --policy.camera={camera}."
-            )
+        check_camera(self.policy, "robot.camera", self.robot)
         if self.policy.seed is None:
             self.policy.seed = self.seed
         self._check_uploads()

@@ -7,9 +7,9 @@ from typing import Any
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
-from relmm.episodes.settings import describe_camera
 from relmm.episodes.summary import DatasetSummary, summarize
 from relmm.features import ACTION_NAMES, DATASET_COLUMNS, FPS, JOINT_NAMES, MAX_THETA_VEL, MAX_X_VEL, Phase
+from relmm.geometry import describe_camera
 
 CONTACT_SHEET = "contact_sheet.png"
 _LEROBOT = "https://github.com/huggingface/lerobot"

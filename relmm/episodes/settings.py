@@ -11,7 +11,7 @@ from huggingface_hub.utils import validate_repo_id
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
 from relmm.errors import ConfigError, DatasetError
 from relmm.features import DEPTH_KEY, FPS, IMAGE_KEY, SCAN_NAMES, STATE_KEY, STATE_NAMES, dataset_features
-from relmm.geometry import camera_info
+from relmm.geometry import camera_info, other_camera
 
 # The columns that LeRobot adds by itself.
 LEROBOT_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -98,7 +98,8 @@ def check_resume(
     if robot_type is not None:
         differences += _differences("robot type", have["robot_type"], robot_type)
     if info is not None and "camera" in info:
-        differences += [f"camera: have {there}, want {here}" for there, here in _cameras(features, info["camera"])]
+        cameras = other_camera(features, info["camera"])
+        differences += [] if cameras is None else [f"camera: have {cameras[0]}, want {cameras[1]}"]
     if differences:
         raise DatasetError(
             f"{root} cannot be continued with these settings: {'; '.join(differences)}; "
@@ -140,10 +141,11 @@ def check_trainable(root: Path | str, camera: str | None = None) -> None:
             f"{root} cannot be trained on: {'; '.join(differences)}; choose a dataset that relmm has recorded, "
             "or record one with relmm-record."
         )
-    for there, here in _cameras(have, camera):
+    cameras = other_camera(have, camera)
+    if cameras is not None:
         raise DatasetError(
-            f"{root} was recorded with the camera {there}, but the policy's is {here}; choose another dataset, or set "
-            "--policy.camera to the dataset's."
+            f"{root} was recorded with the camera {cameras[0]}, but the policy's is {cameras[1]}; choose another "
+            "dataset, or set --policy.camera to the dataset's."
         )
 
 
@@ -183,23 +185,6 @@ def _refuse_old(root: Path | str, features: dict[str, Any]) -> None:
             f"{root} was recorded by relmm 0.1.0, its {STATE_KEY} has no y.vel and no {SCAN_NAMES[0]} to "
             f"{SCAN_NAMES[-1]}; choose a newer dataset, or read it with relmm 0.1.0."
         )
-
-
-def _cameras(features: dict[str, Any], wanted: str | None) -> list[tuple[str, str]]:
-    """The camera of a dataset and the wanted one, in words, if both are known and differ."""
-    feature = features.get(IMAGE_KEY)
-    info = feature.get("info") if isinstance(feature, dict) else None
-    have = info.get("camera") if isinstance(info, dict) else None
-    want = None if wanted is None else camera_info(wanted)
-    return [] if None in (have, want) or have == want else [(describe_camera(have), describe_camera(want))]
-
-
-def describe_camera(camera: Any) -> str:
-    """The camera of a picture's `info` in words."""
-    if not isinstance(camera, dict):
-        return repr(camera)
-    details = ", ".join(f"{key} {value}" for key, value in camera.items() if key != "name")
-    return f"{camera.get('name')} ({details})"
 
 
 def _feature_differences(have: dict[str, Any], want: dict[str, Any]) -> list[str]:

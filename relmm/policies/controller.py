@@ -36,6 +36,7 @@ from relmm.features import (
     action_dict,
     cell_to_xy,
 )
+from relmm.geometry import other_camera
 from relmm.policies.pseudo_reset import random_pseudo_reset
 
 _HOLDING = STATE_NAMES.index("holding.pos")
@@ -140,6 +141,13 @@ class ControllerPolicy(PreTrainedPolicy):
     def __init__(self, config: ControllerConfig, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
+        meta = kwargs.get("dataset_meta")  # LeRobot's factory gives it, where there is a dataset
+        cameras = None if meta is None else other_camera(meta.features, getattr(config, "camera", None))
+        if cameras is not None:
+            raise ConfigError(
+                f"The dataset was recorded with the camera {cameras[0]}, but the policy's is {cameras[1]}; choose "
+                "another dataset, or set --policy.camera to the dataset's."
+            )
         self._rows: list[Row] = []
         self._episodes = 0
 

@@ -85,11 +85,12 @@ def test_evaluate_interrupted_says_so(capsys, monkeypatch, tmp_path):
         ("--eval.n_episodes=0", "must be at least 1"),
         ("--eval.n_videos=-1", "must not be negative"),
         ("--env.type=pusht", "relmm_room"),
+        ("--env.camera=d435", "say --env.camera=paper, or --policy.camera=d435"),
         ("--policy.path=/nowhere/at/all", "No policy can be loaded from '/nowhere/at/all'"),
     ],
 )
 def test_evaluate_bad_input_is_one_sentence(capsys, monkeypatch, tmp_path, bad, message):
-    policy = () if bad.startswith("--policy") else ("--policy.type=relmm_random",)
+    policy = () if bad.startswith("--policy") else ("--policy.type=relmm_scripted",)
     monkeypatch.setattr(sys, "argv", ["relmm-eval", *policy, f"--output_dir={tmp_path / 'out'}", bad])
     with pytest.raises(SystemExit) as stop:
         command.main()

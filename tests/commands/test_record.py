@@ -136,6 +136,17 @@ def test_record_ended_before_its_first_episode_goes_on(run, tmp_path, number):
     assert summarize(root).episodes == saved + 1
 
 
+def test_record_by_a_policy_of_another_camera_is_refused(capsys, monkeypatch, tmp_path):
+    from relmm.commands import record as command
+
+    options = [*SIM, "--policy.type=relmm_scripted", "--robot.camera=d435", f"--dataset.root={tmp_path / 'room'}"]
+    monkeypatch.setattr(sys, "argv", ["relmm-record", *options, "--dataset.num_episodes=1"])
+    with pytest.raises(SystemExit):
+        command.main()
+    assert "say --robot.camera=paper, or --policy.camera=d435" in capsys.readouterr().err
+    assert not (tmp_path / "room").exists()
+
+
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
