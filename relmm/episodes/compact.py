@@ -1,4 +1,4 @@
-"""A copy of a dataset with files of LeRobot's usual sizes, instead of two for each episode.
+"""Files of LeRobot's usual sizes, instead of two for each episode: in a copy of a dataset, or in the dataset itself.
 
 LeRobot's `merge_datasets` would do it in a time that grows with the square of the number of files, and leave
 `meta/episodes/file_index` wrong.
@@ -6,6 +6,7 @@ LeRobot's `merge_datasets` would do it in a time that grows with the square of t
 
 from __future__ import annotations
 
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,16 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from relmm.episodes.folder import INFO, RELMM, TASKS, DatasetFolder, refuse_links
+from relmm.episodes.exchange import exchange_folder, exchange_folders
+from relmm.episodes.folder import DATA_FILES, INFO, RELMM, TASKS, DatasetFolder, refuse_links
 from relmm.episodes.repair import verify_and_repair
 from relmm.episodes.settings import DATA_PATH
 from relmm.episodes.survey import Survey, survey
 from relmm.errors import DatasetError
 
+logger = logging.getLogger(__name__)
+
+_MANY_FILES = 100  # of data; opening them takes LeRobot about a second
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 
 
@@ -57,6 +62,23 @@ def compact(root: Path | str, target: Path) -> int:
     report = verify_and_repair(target)
     assert report.episodes == len(found.episodes)
     return report.episodes
+
+
+def pack(folder: DatasetFolder) -> None:
+    """Give a dataset fewer and larger files, if it has many; for whoever holds its lock.
+
+    LeRobot opens each file, so a long life in one of each episode takes it minutes.
+    """
+    if len(folder.files(DATA_FILES)) <= _MANY_FILES:
+        return
+    target = exchange_folder(folder)
+    shutil.rmtree(target, ignore_errors=True)
+    try:
+        compact(folder.root, target)
+        exchange_folders(folder, ["data", "meta/episodes"])
+    except OSError as error:  # it stays as it was
+        logger.warning("%s keeps its many small files (%s)", folder.root, error.strerror or error)
+    shutil.rmtree(target, ignore_errors=True)
 
 
 def _copy_data(folder: DatasetFolder, found: Survey, info: dict[str, Any], target: Path) -> dict[int, tuple[int, int]]:

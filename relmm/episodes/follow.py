@@ -115,7 +115,8 @@ class EpisodeFollower:
         self._folder = DatasetFolder(root)
         self._camera = camera
         self._data_path = self._find_data_path()
-        self._last_episodes: dict[str, int] = {}  # number of the last one, by file of meta/episodes
+        # By file of meta/episodes: which one it was when it was read, and the number of its last episode.
+        self._last_episodes: dict[str, tuple[int, int]] = {}
 
     def poll(self) -> list[Episode]:
         """The episodes that were saved since the last call; none while there is no dataset.
@@ -160,17 +161,26 @@ class EpisodeFollower:
 
     def _last_episode(self, name: str) -> int:
         """Of a file of meta/episodes; for one that cannot be read, a number that does not let it be skipped."""
-        if name not in self._last_episodes:
+        known = self._last_episodes.get(name)
+        if known is None or known[0] != self._inode(name):  # another file has taken its place, with more in it
             self._rows(name)
-        return self._last_episodes.get(name, self.next)
+            known = self._last_episodes.get(name)
+        return self.next if known is None else known[1]
+
+    def _inode(self, name: str) -> int:
+        try:
+            return (self._folder.root / name).stat().st_ino
+        except FileNotFoundError:
+            return -1
 
     def _rows(self, name: str) -> list[dict[str, Any]] | None:
+        inode = self._inode(name)  # before it is read: what comes in between is seen as another one the next time
         table = read_places(self._folder.root / name)
         if table is None:
             return None
         rows: list[dict[str, Any]] = table.to_pylist()
         if rows:
-            self._last_episodes[name] = rows[-1]["episode_index"]
+            self._last_episodes[name] = inode, rows[-1]["episode_index"]
         return rows
 
 

@@ -10,6 +10,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from relmm.episodes.exchange import finish_exchange
 from relmm.episodes.folder import EPISODE_FILES, INFO, RELMM, STATS, TASKS, DatasetFolder
 from relmm.episodes.survey import Survey, survey
 from relmm.errors import DatasetError
@@ -72,6 +73,7 @@ def verify_and_repair(root: Path | str) -> RepairReport:
 
 def repair(folder: DatasetFolder) -> RepairReport:
     """`verify_and_repair` for whoever holds the lock."""
+    finish_exchange(folder)
     stored = folder.read_json(INFO)
     info = stored or _rebuilt_info(folder)
     found = survey(folder, info["data_path"])

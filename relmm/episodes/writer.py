@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import pyarrow as pa
 
+from relmm.episodes.compact import pack
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, STATS, TASKS, DatasetFolder
 from relmm.episodes.repair import RepairReport, repair
 from relmm.episodes.settings import add_run, check_new, check_resume, features_to_store
@@ -108,6 +109,7 @@ class DurableDataset:
             raise DatasetError(_cannot_write(folder.root, error, None)) from error
         try:
             report = repair(folder)
+            pack(folder)
             dataset = _resume_staged(folder, repo_id)
             if info is not None:
                 meta = dataset.meta
@@ -168,6 +170,8 @@ class DurableDataset:
         if self._closed:
             return
         self._closed = True
+        if self._failure is None:
+            pack(self._folder)
         self._folder.clear_scratch()
         self._folder.unlock()
 

@@ -8,7 +8,7 @@ import time
 
 from episode_helpers import REPO_ID, TASK, arguments, length_of, record
 
-from relmm.episodes import DurableDataset, EpisodeRecorder
+from relmm.episodes import DurableDataset, EpisodeRecorder, compact, exchange
 from relmm.errors import DatasetError
 
 
@@ -78,3 +78,23 @@ def record_without_end(root, resume, writer):
         for step in range(length_of(episode)):
             recorder.add_frame(*arguments(episode, step), TASK)
         recorder.save_episode()
+
+
+def die_while_packing(root, done):
+    """Be killed while small files become a few large ones: while they are copied (-1), or after `done` exchanges."""
+    compact._MANY_FILES = 3
+    swap, calls = exchange._exchange, []
+
+    def counted(first, second):
+        if len(calls) == done:
+            os.kill(os.getpid(), signal.SIGKILL)
+        calls.append(first)
+        swap(first, second)
+
+    exchange._exchange = counted
+    kill_instead = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # noqa: E731
+    if done < 0:
+        compact._copy_episodes = kill_instead
+    if done == 2:
+        exchange.sync = lambda path: kill_instead() if len(calls) == 2 else None
+    DurableDataset.open(root, REPO_ID).close()
