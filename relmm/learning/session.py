@@ -61,6 +61,7 @@ class Session:
         self._save, self._evaluate, self._show, self._upload = save, evaluate, show, upload
         self._started = time.monotonic() - metrics.seconds  # a resumed run goes on
         self._saved_at = -1
+        self._logged: dict[str, float] = {}
 
     def live(self, trainer: Trainer, should_stop: Callable[[], bool]) -> None:
         """Train on a robot until the last step, or until told to stop; ends with a checkpoint."""
@@ -72,7 +73,7 @@ class Session:
             before = self._progress.steps
             trainer.navigation_step()
             self._after(before)
-        self._checkpoint()
+        self._end()
 
     def follow(self, episodes: Iterable[Episode]) -> None:
         """Train on episodes that come in from elsewhere, until the last step or the last of them."""
@@ -84,7 +85,7 @@ class Session:
             self._after(before, save=True)
             if self._progress.steps >= self._schedule.steps:
                 break
-        self._checkpoint()
+        self._end()
 
     def _begin(self) -> None:
         if self._progress.attempts + self._progress.steps == 0:
@@ -94,7 +95,7 @@ class Session:
         schedule, step = self._schedule, self._progress.steps
         self._show(self._status())
         if _passed(before, step, schedule.log_freq):
-            self._metrics.write(**self._status(), **self._learner.logs)
+            self._log()
         evaluate, upload = (_passed(before, step, every) for every in (schedule.eval_freq, schedule.upload_freq))
         if save or evaluate or upload or _passed(before, step, schedule.save_freq):
             self._checkpoint()  # before the evaluation, which takes long and may be stopped
@@ -102,6 +103,15 @@ class Session:
             self._metrics.write(**self._status(), **scores)
         if upload:
             self._upload()
+
+    def _end(self) -> None:
+        self._checkpoint()
+        if self._logged != self._progress.asdict():
+            self._log()  # so that the last line counts all there is
+
+    def _log(self) -> None:
+        self._logged = self._progress.asdict()
+        self._metrics.write(**self._status(), **self._learner.logs)
 
     def _checkpoint(self) -> None:
         if self._saved_at != self._progress.steps:
