@@ -39,6 +39,7 @@ def run[Config](
         prepare: may change the arguments before they are parsed.
     """
     _quiet()
+    sys.stdout, sys.stderr = _Terminal(sys.stdout), _Terminal(sys.stderr)
     try:
         _register_plugins()
         prepare(sys.argv)
@@ -49,6 +50,27 @@ def run[Config](
     except KeyboardInterrupt:
         print(f"{command}: interrupted.", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
+
+
+class _Terminal:
+    """A stream that takes what is written to it also when nobody is there to read it any more."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """See `io.TextIOBase.write`."""
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """See `io.TextIOBase.flush`."""
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def _register_plugins() -> None:
@@ -120,14 +142,14 @@ def progress(total: int, unit: str, title: str | None = None, leave: bool = True
 
 
 class StopOnSignal:
-    """Notes the first SIGINT or SIGTERM instead of dying of it; a second one ends the process as usual."""
+    """Notes the first SIGINT, SIGTERM or SIGHUP instead of dying of it; a second one ends the process as usual."""
 
     def __init__(self) -> None:
         self.stopped = False
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> StopOnSignal:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             self._previous[number] = signal.signal(number, self._note)
         return self
 

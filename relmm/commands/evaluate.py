@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
-from contextlib import nullcontext
+from collections.abc import Callable
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import numpy as np
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
-from relmm.commands.cli import dated_folder, progress, run
+from relmm.commands.cli import StopOnSignal, dated_folder, progress, run
 from relmm.commands.policies import check_camera, make_actor, policy_from_path, take_seed
 from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES
@@ -121,34 +123,47 @@ class EpisodeScore:
 
 
 def evaluate(config: EvalConfig) -> None:
-    """Run the episodes, print a table, and write `eval_info.json` and videos."""
+    """Run the episodes, and write `eval_info.json` after each; then print a table. A signal ends it between steps."""
     assert isinstance(config.env, RelmmRoomEnvConfig)
     assert config.policy is not None
     assert config.output_dir is not None
     take_seed(config.policy, 0)
     actor = make_actor(config.policy)
     env = RelmmRoomEnv(**{**config.env.gym_kwargs, "render_mode": None})
-    scores = []
-    try:
+    scores: list[EpisodeScore] = []
+    with StopOnSignal() as signals, closing(env):
         for index in range(config.eval.n_episodes):
             filmed = index < config.eval.n_videos
             video = config.output_dir / "videos" / f"eval_episode_{index}.mp4" if filmed else None
             title = f"episode {index + 1}/{config.eval.n_episodes}"
-            scores.append(run_episode(env, actor, config.seed + index, title, video))
-    finally:
-        env.close()
-    print(table(scores))
-    _write(config.output_dir, scores)
+            score = run_episode(env, actor, config.seed + index, title, video, lambda: signals.stopped)
+            if score is None:
+                break
+            scores.append(score)
+            _write(config.output_dir, scores)
+    if scores:
+        _show(config.output_dir, scores)
+    else:
+        print("no episode was finished")
 
 
-def run_episode(env: RelmmRoomEnv, actor: Actor, seed: int, title: str, video: Path | None) -> EpisodeScore:
-    """One episode with a progress bar, and a film of it at four times its speed."""
+def run_episode(
+    env: RelmmRoomEnv,
+    actor: Actor,
+    seed: int,
+    title: str,
+    video: Path | None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> EpisodeScore | None:
+    """One episode with a progress bar, and a film of it at four times its speed; None if it was stopped."""
     observation, info = env.reset(seed=seed)
     actor.reset()
     film = Film(env.robot.body, video) if video is not None else None
     with progress(env.navigation_steps, "step", title, leave=False) as bar, film or nullcontext():
         ended = False
         while not ended:
+            if should_stop():
+                return None
             action = actor.act(_robot_observation(observation))
             if film is not None:
                 film.caption, film.inset = _caption(info, actor.describe(action)), actor.picture()
@@ -201,7 +216,14 @@ def _write(folder: Path, scores: list[EpisodeScore]) -> None:
     overall["pc_success"] = 100 * float(np.mean(share >= SUCCESS_SHARE))
     overall["avg_sum_reward"] = float(np.mean([score.picked_up_judged for score in scores]))
     info = {"overall": overall, "per_episode": [asdict(score) for score in scores]}
-    (folder / "eval_info.json").write_text(json.dumps(info, indent=2))
+    temporary = folder / ".eval_info.json"
+    temporary.write_text(json.dumps(info, indent=2))
+    os.replace(temporary, folder / "eval_info.json")
+
+
+def _show(folder: Path, scores: list[EpisodeScore]) -> None:
+    share = np.array([score.collected / score.total for score in scores])
+    print(table(scores))
     print(f"\ncollected {share.mean():.1%} of the objects (std {share.std():.1%}); details in {folder}")
     for video in sorted(folder.glob("videos/*.mp4")):
         print(f"video: {video}")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from relmm.commands.evaluate import run_episode
+from relmm.commands.evaluate import EpisodeScore, run_episode
 from relmm.commands.train_config import TrainEvalConfig
 from relmm.learning.actor import Actor
 from relmm.policies.learning import LearningPolicy
@@ -23,20 +24,33 @@ class RoomEvaluation:
         actor: the policy that is being trained, with its processors.
         config: how many episodes, of which seeds.
         videos: where to put them.
+        should_stop: asked between steps.
     """
 
-    def __init__(self, robot: LocobotSimConfig, actor: Actor, config: TrainEvalConfig, videos: Path) -> None:
-        self._actor, self._config, self._videos = actor, config, videos
+    def __init__(
+        self,
+        robot: LocobotSimConfig,
+        actor: Actor,
+        config: TrainEvalConfig,
+        videos: Path,
+        should_stop: Callable[[], bool],
+    ) -> None:
+        self._actor, self._config, self._videos, self._should_stop = actor, config, videos, should_stop
         self._env = RelmmRoomEnv(room=robot.room, num_objects=robot.num_objects, camera=robot.camera)
 
     def __call__(self, step: int) -> dict[str, Any]:
-        """The scores of the policy as it is now, for the metrics."""
+        """The scores of the policy as it is now, for the metrics; none if it was stopped."""
         policy = self._actor.policy
         assert isinstance(policy, LearningPolicy)
         policy.sampling = False
         policy.eval()
         try:
-            scores = [self._episode(step, index) for index in range(self._config.n_episodes)]
+            scores = []
+            for index in range(self._config.n_episodes):
+                score = self._episode(step, index)
+                if score is None:
+                    return {}
+                scores.append(score)
         finally:
             policy.sampling = True
             policy.train()
@@ -48,8 +62,8 @@ class RoomEvaluation:
             "eval_grasp_success": sum(s.picked_up for s in scores) / max(sum(s.grasps for s in scores), 1),
         }
 
-    def _episode(self, step: int, index: int) -> Any:
+    def _episode(self, step: int, index: int) -> EpisodeScore | None:
         filmed = index < self._config.n_videos
         video = self._videos / f"videos_step_{step:06d}" / f"eval_episode_{index}.mp4" if filmed else None
         title = f"evaluation {index + 1}/{self._config.n_episodes}"
-        return run_episode(self._env, self._actor, self._config.seed + index, title, video)
+        return run_episode(self._env, self._actor, self._config.seed + index, title, video, self._should_stop)

@@ -1,6 +1,10 @@
 """relmm-eval, and its agreement with lerobot-eval."""
 
 import json
+import os
+import pty
+import signal
+import subprocess
 import sys
 
 import av
@@ -62,6 +66,42 @@ def test_what_took_nothing_has_no_rate():
     assert rows[1] == ["2", "50.0%", "10.0", "20.0", "50.0%", "25.0", "10.0", "20.0"]
     assert rows[2] == ["mean", "25.0%", "5.0", "10.0", "50.0%", "25.0", "10.0", "20.0"]
     assert [line.split()[4] for line in command.table([nothing]).splitlines()[1:]] == ["-", "-", "-"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_what_was_measured_before_a_signal_is_kept(number, capsys, monkeypatch, tmp_path):
+    """It ends between two steps of the second episode, and the film can be played."""
+    steps, step = [], command.RelmmRoomEnv.step
+
+    def interrupted(env, action):
+        steps.append(action)
+        if len(steps) == 5:
+            signal.raise_signal(number)
+        return step(env, action)
+
+    monkeypatch.setattr(command.RelmmRoomEnv, "step", interrupted)
+    arguments = ["--policy.type=relmm_random", "--env.navigation_steps=2", "--eval.n_episodes=9", "--eval.n_videos=9"]
+    monkeypatch.setattr(sys, "argv", ["relmm-eval", *arguments, f"--output_dir={tmp_path / 'out'}"])
+    command.main()
+    info = json.loads((tmp_path / "out" / "eval_info.json").read_text())
+    finished = info["overall"]["n_episodes"]
+    assert 1 <= finished == len(info["per_episode"]) < 5
+    assert len(steps) == 5
+    assert f"collected {info['overall']['mean_share_collected']:.1%}" in capsys.readouterr().out
+    with av.open(str(tmp_path / "out" / "videos" / f"eval_episode_{finished}.mp4")) as container:
+        assert next(container.decode(video=0)).width == 880
+
+
+def test_a_terminal_that_is_gone_costs_no_result(tmp_path):
+    """As when a window is closed, or a connection is lost: the terminal answers EIO to whatever is written."""
+    ours, theirs = pty.openpty()
+    options = ["--policy.type=relmm_random", "--env.navigation_steps=2", "--eval.n_episodes=2", "--eval.n_videos=0"]
+    script = [sys.executable, "-m", "relmm.commands.evaluate", *options, f"--output_dir={tmp_path / 'out'}"]
+    process = subprocess.Popen(script, stdin=theirs, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    os.close(ours)
+    assert process.wait(300) == 0
+    assert json.loads((tmp_path / "out" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
 
 
 def test_evaluate_interrupted_says_so(capsys, monkeypatch, tmp_path):

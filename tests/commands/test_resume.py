@@ -3,6 +3,7 @@
 import contextlib
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,7 +17,9 @@ from relmm.commands import record as record_module
 from relmm.commands import train as module
 from relmm.episodes import DurableDataset, read_episodes, summarize, verify_and_repair
 from relmm.episodes.settings import LEROBOT_COLUMNS
+from relmm.learning.progress import read_metrics
 from relmm.policies.relmm.learner import ReLMMLearner
+from relmm.sim.env import RelmmRoomEnv
 
 Train = Callable[..., str]
 LAST_DATA, LAST_EPISODE = "data/*/*.parquet", "meta/episodes/*/*.parquet"
@@ -231,3 +234,21 @@ def test_recording_goes_on_after_repairs(run: Path, damage, monkeypatch, capsys)
     said = capsys.readouterr().out
     assert "was cut off" in said or "was rebuilt" in said
     assert len(list(read_episodes(root))) == summarize(root).episodes
+
+
+# --- Signals -------------------------------------------------------------------------------------------------
+def test_an_evaluation_is_stopped_between_steps_after_the_checkpoint(call: Train, tiny, tmp_path, monkeypatch) -> None:
+    steps, step = [], RelmmRoomEnv.step
+
+    def interrupted(env: RelmmRoomEnv, action: Any) -> Any:
+        steps.append(sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir()))
+        signal.raise_signal(signal.SIGTERM)
+        return step(env, action)
+
+    monkeypatch.setattr(RelmmRoomEnv, "step", interrupted)
+    options = [option for option in tiny if not option.startswith(("--env_eval_freq", "--save_freq"))]
+    said = call(*options, "--steps=9", "--env_eval_freq=2", "--save_freq=100", f"--output_dir={tmp_path / 'run'}")
+    assert "Stopping: saving what there is" in said
+    assert steps == [["000000", "000002", "last"]], "once, and with what was learned saved before"
+    assert counters(tmp_path / "run")["episodes"] == summarize(tmp_path / "run" / "dataset").episodes
+    assert not any("eval_collected" in line for line in read_metrics(tmp_path / "run" / "metrics.jsonl"))
