@@ -31,6 +31,7 @@ class Fault:
         status: answer with this HTTP status; 0 to answer as usual.
         delay_s: wait before answering.
         cut: close the connection in the middle of the answer, or instead of one.
+        drip_s: send a byte of the answer, its headers among them, and wait so long before the next.
         times: how often; the next request is answered as usual.
         headers: of the answer, for `status`.
         hits: how often it has happened.
@@ -40,6 +41,7 @@ class Fault:
     status: int = 0
     delay_s: float = 0.0
     cut: bool = False
+    drip_s: float = 0.0
     times: int = 1_000_000
     headers: dict[str, str] = field(default_factory=dict)
     hits: int = 0
@@ -147,6 +149,22 @@ class _Refusal(Exception):
         self.status, self.headers = status, {"X-Error-Code": code, "X-Error-Message": message or code}
 
 
+class _Dripping:
+    """A file that is written byte by byte."""
+
+    def __init__(self, file: Any, wait_s: float) -> None:
+        self._file, self._wait_s = file, wait_s
+
+    def write(self, data: bytes) -> None:
+        for byte in data:
+            self._file.write(bytes([byte]))
+            self._file.flush()
+            time.sleep(self._wait_s)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: Hub
@@ -162,6 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.requests.append(request)
         fault = next((fault for fault in self.server.faults if fault.strikes(request)), Fault(""))
         self.cut = fault.cut
+        plain, self.wfile = self.wfile, _Dripping(self.wfile, fault.drip_s) if fault.drip_s else self.wfile
         time.sleep(fault.delay_s)
         try:
             if fault.status:
@@ -171,6 +190,8 @@ class _Handler(BaseHTTPRequestHandler):
         except _Refusal as refusal:
             message = json.dumps({"error": str(refusal)}).encode()
             self._send(refusal.status, message, refusal.headers)
+        finally:
+            self.wfile = plain
 
     do_GET = do_HEAD = do_POST = do_DELETE = do_PUT = _serve
 

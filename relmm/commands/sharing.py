@@ -16,7 +16,7 @@ from typing import IO
 
 from relmm.commands.train_config import TrainConfig
 from relmm.episodes.folder import INFO
-from relmm.episodes.remote import limit_waiting, reserve
+from relmm.episodes.remote import reserve
 from relmm.errors import HubError
 from relmm.learning.untrusted import CONFIG
 
@@ -157,7 +157,6 @@ def check_dataset_upload(repo_id: str, private: bool | None, resume: bool) -> No
 
 
 def _check(repo_id: str, repo_type: str, private: bool | None, free_of: str | None) -> None:
-    limit_waiting()
     problem = reserve(repo_id, repo_type, private, free_of)
     if problem:
         print(problem, file=sys.stderr)

@@ -15,7 +15,6 @@ from relmm.commands.curve import draw_learning_curve
 from relmm.commands.model_card import ModelFacts, model_card
 from relmm.episodes import UploadedDataset, check_repo_id, upload_dataset
 from relmm.episodes.folder import DatasetFolder
-from relmm.episodes.remote import limit_waiting
 from relmm.episodes.upload import recorded_runs
 from relmm.errors import ConfigError
 from relmm.learning.checkpoint import last_checkpoint, pretrained_model
@@ -102,7 +101,6 @@ def upload(config: UploadConfig) -> None:
     """Upload the dataset, then the checkpoint that says which one it was trained on."""
     if config.background:
         os.nice(_NICENESS)
-    limit_waiting()
     # Looked up first: whatever this checkpoint has learned from is in the dataset by now.
     checkpoint = _newest(config.output_dir)
     dataset = None

@@ -23,13 +23,11 @@ from huggingface_hub.errors import (
     RevisionNotFoundError,
 )
 
+from relmm.episodes.patience import limit_waiting
 from relmm.errors import HubError
 
 _PRECONDITION_FAILED = 412
 _SPARE_BYTES = 100 << 20  # of the disk, beyond what is downloaded
-
-
-_TIMEOUT_S = 100.0  # without a byte from the Hub
 
 
 def reason(repo: str, revision: str, error: Exception) -> str:
@@ -81,6 +79,8 @@ def download(repo_id: str, repo_type: str, revision: str, limits: dict[str, int]
         Exception: of huggingface_hub or its HTTP library; see `reason`.
     """
     from huggingface_hub import constants, snapshot_download
+
+    limit_waiting()
 
     def snapshot(**where: Any) -> Path:
         patterns = list(limits)
@@ -166,6 +166,7 @@ def push_folder(
     Raises:
         HubError: and nothing has changed but for a new, empty repository.
     """
+    limit_waiting()
     api = HfApi()
     try:
         api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True)
@@ -234,6 +235,7 @@ def reserve(repo_id: str, repo_type: str, private: bool | None, free_of: str | N
     Raises:
         HubError: uploads would be refused.
     """
+    limit_waiting()
     api, repo = HfApi(), f"{repo_type} {repo_id}"
     try:
         api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True)
@@ -246,17 +248,3 @@ def reserve(repo_id: str, repo_type: str, private: bool | None, free_of: str | N
     if taken:
         raise HubError(f"the {repo} on the Hub is another run's already; choose another name for this one.")
     return ""
-
-
-def limit_waiting() -> None:
-    """Let transfers of this process fail when the Hub is silent; huggingface_hub would wait forever."""
-    import httpx
-    from huggingface_hub import set_client_factory
-    from huggingface_hub.utils._http import default_client_factory
-
-    def factory() -> httpx.Client:
-        client = default_client_factory()
-        client.timeout = httpx.Timeout(_TIMEOUT_S)
-        return client
-
-    set_client_factory(factory)
