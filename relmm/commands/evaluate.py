@@ -214,7 +214,7 @@ def _write(folder: Path, scores: list[EpisodeScore]) -> None:
     share = np.array([score.collected / score.total for score in scores])
     overall = {"mean_share_collected": share.mean(), "std_share_collected": share.std(), "n_episodes": len(scores)}
     overall["pc_success"] = 100 * float(np.mean(share >= SUCCESS_SHARE))
-    overall["avg_sum_reward"] = float(np.mean([score.picked_up_judged for score in scores]))
+    overall["avg_sum_reward"] = float(np.mean([score.collected for score in scores]))
     info = {"overall": overall, "per_episode": [asdict(score) for score in scores]}
     temporary = folder / ".eval_info.json"
     temporary.write_text(json.dumps(info, indent=2))

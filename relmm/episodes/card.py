@@ -13,7 +13,6 @@ from relmm.geometry import describe_camera
 
 CONTACT_SHEET = "contact_sheet.png"
 _LEROBOT = "https://github.com/huggingface/lerobot"
-_BADGES = "https://huggingface.co/datasets/huggingface/badges/resolve/main"
 _PHASES = {
     Phase.CURRICULUM: "the policy practised grasping",
     Phase.LEARNING: "the policy acted",
@@ -64,11 +63,6 @@ def dataset_card(folder: DatasetFolder, repo_id: str, license: str, contact_shee
 def _head(repo_id: str, info: dict[str, Any], contact_sheet: bool) -> str:
     sheet = f"\n\n![Pictures of the dataset]({CONTACT_SHEET})\n*What the robot does next, episode:frame.*"
     return f"""# {repo_id}
-
-<a class="flex" href="https://huggingface.co/spaces/lerobot/visualize_dataset?path={repo_id}">
-<img class="block dark:hidden" src="{_BADGES}/visualize-this-dataset-xl.svg"/>
-<img class="hidden dark:block" src="{_BADGES}/visualize-this-dataset-xl-dark.svg"/>
-</a>
 
 The life of a LoCoBot ({info.get("robot_type")}) that picks things up in a room, recorded with `relmm`, a
 [LeRobot]({_LEROBOT}) package of ReLMM, as a LeRobot {info.get("codebase_version")} dataset.

@@ -21,8 +21,9 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """One LoCoBot in one room; an episode scatters the objects anew and lasts a number of navigation steps.
 
     Observations: `pixels` (`front`: uint8 (100, 100, 3)) and `agent_pos` (float32, `relmm.features.STATE_NAMES`).
-    Actions: float32, `relmm.features.ACTION_NAMES`. Reward: 1 when the robot judges that it picked something up.
-    What is picked up counts as collected once it lies in the robot's basket (a placement at `BASKET_XY`).
+    Actions: float32, `relmm.features.ACTION_NAMES`. What is picked up counts as collected once it lies in the robot's
+    basket (a placement at `BASKET_XY`). Reward: how many objects more than before lie there, so that an episode's
+    rewards add up to what was collected. `info` tells how many grasps the robot itself judged to be successes.
 
     Args:
         room, num_objects, camera: as in `LocobotSimConfig`.
@@ -68,12 +69,13 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self.robot.connect()
         self.robot.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
         self._steps = self._free_grasps_used = self._judged = self._attempts = self._true_successes = 0
-        return self._observe(), self._info()
+        info = self._info()
+        self._collected = info["objects_collected"]
+        return self._observe(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Run one skill; see the class."""
         done = self.robot.send_action(dict(zip(ACTION_NAMES, action.tolist(), strict=True)))
-        reward = 0.0
         match Skill(int(done["skill.pos"])):
             case Skill.NAVIGATE:
                 self._steps, self._free_grasps_used = self._steps + 1, 0
@@ -82,9 +84,10 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
                 self._free_grasps_used += 1
                 self._attempts += 1
                 self._true_successes += self.robot.body.truth.held()
-                reward = float(self.robot.skills.holding)
-                self._judged += int(reward)
+                self._judged += self.robot.skills.holding
         info = self._info()
+        reward = float(info["objects_collected"] - self._collected)
+        self._collected = info["objects_collected"]
         terminated = info["objects_collected"] == info["objects_total"]
         return self._observe(), reward, terminated, self._steps >= self.navigation_steps and not terminated, info
 

@@ -38,9 +38,9 @@ def test_evaluate_agrees_with_lerobot_eval(run, tmp_path):
     assert theirs.returncode == 0, theirs.stderr
     own = json.loads((tmp_path / "ours/eval_info.json").read_text())
     stock = json.loads((tmp_path / "theirs/eval_info.json").read_text())
-    picked_up = [episode["picked_up_judged"] for episode in own["per_episode"]]
-    assert stock["per_task"][0]["metrics"]["sum_rewards"] == picked_up
-    assert sum(picked_up) > 0
+    collected = [episode["collected"] for episode in own["per_episode"]]
+    assert stock["per_task"][0]["metrics"]["sum_rewards"] == collected
+    assert sum(collected) > 0
     assert own["overall"]["avg_sum_reward"] == pytest.approx(stock["overall"]["avg_sum_reward"])
     assert own["overall"]["pc_success"] == stock["overall"]["pc_success"]
 

@@ -123,12 +123,25 @@ def test_collecting_everything_is_success_and_ends_the_episode() -> None:
     env.reset(seed=0)
     x, y = object_in_front(env)
     _, reward, terminated, truncated, info = act(env, Skill.GRASP, x=x, y=y)
-    assert (reward, terminated, truncated, info["objects_collected"]) == (1.0, False, False, 0)
+    assert (reward, terminated, truncated, info["objects_collected"]) == (0.0, False, False, 0)
     assert (info["grasp_attempts"], info["grasp_successes"], info["grasp_successes_judged"]) == (1, 1, 1)
     _, reward, terminated, truncated, info = act(env, Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
-    assert (reward, terminated, truncated) == (0.0, True, False)
+    assert (reward, terminated, truncated) == (1.0, True, False)
     assert (info["is_success"], info["objects_collected"], info["objects_total"]) == (True, 1, 1)
     env.close()
+
+
+def test_putting_down_and_grasping_again_earns_nothing(env: RelmmRoomEnv) -> None:
+    x, y = object_in_front(env)
+    rewards, judged = [], 0
+    for _ in range(3):
+        _, reward, _, _, info = act(env, Skill.GRASP, x=x, y=y)
+        _, another, _, _, _ = act(env, Skill.PLACE, x=x, y=y)
+        x, y = env.robot.body.truth.objects_in_robot_frame()[0, :2].tolist()
+        rewards += [reward, another]
+        judged = info["grasp_successes_judged"]
+    assert judged >= 2
+    assert rewards == [0.0] * 6
 
 
 def test_an_empty_grasp_counts_as_an_attempt_and_earns_nothing(env: RelmmRoomEnv) -> None:
