@@ -85,7 +85,7 @@ class Run:
         cursor = -1
         if self.checkpoint is not None:
             counters = load_training_state(self.checkpoint, self.learner, self.rng)
-            cursor, self.progress.interventions = counters["episodes"], counters["interventions"]
+            cursor, self.progress.interventions = counters["episodes"], counters.get("interventions", 0)
         if self.config.dataset.init is not None:
             root = local_root(self.config.dataset.init)
             check_trainable(root, self.policy.config.camera)
