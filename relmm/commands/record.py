@@ -15,8 +15,8 @@ from relmm.commands.policies import FreshWeights, make_actor, policy_from_path, 
 from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
-from relmm.episodes import EpisodeRecorder, check_new, check_repo_id, saved_episodes, summarize
-from relmm.errors import ConfigError
+from relmm.episodes import MAX_STEPS, EpisodeRecorder, check_new, check_repo_id, saved_episodes, summarize
+from relmm.errors import MANY, MAX_SEED, check_range
 from relmm.learning.actor import Actor
 from relmm.learning.collect import Collector
 from relmm.learning.life import Life
@@ -47,8 +47,7 @@ class RecordDatasetConfig:
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
-        if self.num_episodes < 1:
-            raise ConfigError(f"dataset.num_episodes is {self.num_episodes}, but must be at least 1.")
+        check_range("dataset.num_episodes", self.num_episodes, 1, MANY)
 
     def folder(self) -> Path:
         """The dataset's folder."""
@@ -81,12 +80,9 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         self.policy = policy_from_path(self.policy)
-        if self.seed < 0:
-            raise ConfigError(f"seed is {self.seed}, but must not be negative.")
-        if self.max_steps < 1:
-            raise ConfigError(f"max_steps is {self.max_steps}, but must be at least 1.")
-        if self.pseudo_reset_steps < 0:
-            raise ConfigError(f"pseudo_reset_steps is {self.pseudo_reset_steps}, but must not be negative.")
+        check_range("seed", self.seed, 0, MAX_SEED)
+        check_range("max_steps", self.max_steps, 1, MAX_STEPS)
+        check_range("pseudo_reset_steps", self.pseudo_reset_steps, 0, MAX_STEPS)
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:

@@ -83,7 +83,7 @@ def test_evaluate_interrupted_says_so(capsys, monkeypatch, tmp_path):
         ("--env.room=no_such_room", "no_obstacles"),
         ("--env.navigation_steps=0", "must be at least 1"),
         ("--eval.n_episodes=0", "must be at least 1"),
-        ("--eval.n_videos=-1", "must not be negative"),
+        ("--eval.n_videos=-1", "must be at least 0"),
         ("--env.type=pusht", "relmm_room"),
         ("--policy.path=/nowhere/at/all", "No policy can be loaded from '/nowhere/at/all'"),
     ],
