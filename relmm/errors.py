@@ -27,3 +27,27 @@ class PhysicsError(RelmmError):
 
 class RenderingError(RelmmError):
     """No usable OpenGL on this machine."""
+
+
+class DiskError(RelmmError):
+    """A file cannot be written."""
+
+
+def check_range(name: str, value: float, low: float, high: float) -> None:
+    """Refuse a setting that is out of its range, or not a number.
+
+    Args:
+        name: of the setting, as on the command line.
+        value: that it has.
+        low: the least that is allowed.
+        high: the most that is allowed.
+
+    Raises:
+        ConfigError: it is out of range.
+    """
+    if not low <= value <= high:
+        raise ConfigError(f"{name} is {value}, but must be at least {low:,} and at most {high:,}.")
+
+
+MAX_SEED = 2**32 - 1  # torch takes more, but runs add small numbers to it
+MANY = 10**9  # of anything that is counted

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import logging
@@ -16,7 +15,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn
 
-import draccus
 from tqdm import tqdm
 
 from relmm.errors import ConfigError, RelmmError
@@ -44,7 +42,7 @@ def run[Config](
         _register_plugins()
         prepare(sys.argv)
         job(_parse(config_class))
-    except (RelmmError, OSError) as error:
+    except (RelmmError, OSError, MemoryError) as error:
         print(f"{command}: {_sentence(error)}", file=sys.stderr)
         sys.exit(_USAGE_ERROR)
     except KeyboardInterrupt:
@@ -103,7 +101,7 @@ def _parse[Config](config_class: type[Config]) -> Config:
         # The parser has printed its usage and an error; draccus hides our own checks' words among the causes.
         last_line = messages.getvalue().strip().split("\n")[-1].split("error: ", 1)[-1]
         raise own_error(stop) or ConfigError(f"{last_line} (--help_all shows what there is).") from stop
-    except (draccus.utils.DraccusException, argparse.ArgumentError) as error:
+    except Exception as error:  # whatever the parser meets, somebody has typed it, or has a file with it
         raise own_error(error) or ConfigError(_sentence(error)) from error
 
 

@@ -18,7 +18,7 @@ from lerobot.envs.configs import EnvConfig
 
 from relmm.commands.cli import StopOnSignal, dated_folder, progress, run
 from relmm.commands.policies import check_camera, make_actor, policy_from_path, take_seed
-from relmm.errors import ConfigError
+from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
 from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES
 from relmm.learning.actor import Actor
 from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
@@ -49,10 +49,8 @@ class EvalSettings:
     n_videos: int = 1
 
     def __post_init__(self) -> None:
-        if self.n_episodes < 1:
-            raise ConfigError(f"eval.n_episodes is {self.n_episodes}, but must be at least 1.")
-        if self.n_videos < 0:
-            raise ConfigError(f"eval.n_videos is {self.n_videos}, but must not be negative.")
+        check_range("eval.n_episodes", self.n_episodes, 1, MANY)
+        check_range("eval.n_videos", self.n_videos, 0, MANY)
 
 
 @dataclass
@@ -78,8 +76,7 @@ class EvalConfig:
         if not isinstance(self.env, RelmmRoomEnvConfig):
             raise ConfigError(f"relmm-eval needs --env.type=relmm_room, not {self.env.type}.")
         check_camera(self.policy, "env.camera", self.env)
-        if self.seed < 0:
-            raise ConfigError(f"seed is {self.seed}, but must not be negative.")
+        check_range("seed", self.seed, 0, MAX_SEED)
         if self.output_dir is None:
             self.output_dir = dated_folder("eval", f"{self.env.room}_{self.policy.type}")
         if self.output_dir.exists():

@@ -12,8 +12,9 @@ from relmm.episodes import check_trainable, verify_and_repair
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, RELMM, STATS, TASKS
 from relmm.episodes.hub import download_dataset
 from relmm.errors import ConfigError, DatasetError
-from relmm.learning.checkpoint import install_checkpoint, portable_config, pretrained_model
+from relmm.learning.checkpoint import install_checkpoint, pretrained_model
 from relmm.learning.hub import METRICS, POLICY_FILES, Source, fetch_checkpoint, split_revision
+from relmm.learning.settings import SETTINGS, portable_settings
 from relmm.learning.untrusted import read_json
 
 _PATH, _OUTPUT = "--policy.path=", "--output_dir="
@@ -75,8 +76,8 @@ def _make_run(repo_id: str, revision: str, output: Path) -> None:
 def _copy_run(model: Path, dataset: Path, source: Source, run: Path) -> None:
     names = [path.name for path in model.iterdir() if any(fnmatch(path.name, pattern) for pattern in POLICY_FILES)]
     install_checkpoint(run / "checkpoints", source.step, model, names)
-    settings = pretrained_model(run / "checkpoints" / f"{source.step:06d}") / "train_config.json"
-    settings.write_text(json.dumps(portable_config(read_json(settings)), indent=4), encoding="utf-8")
+    settings = pretrained_model(run / "checkpoints" / f"{source.step:06d}") / SETTINGS
+    settings.write_text(json.dumps(portable_settings(read_json(settings)), indent=4), encoding="utf-8")
     if (model / METRICS).is_file():
         shutil.copyfile(model / METRICS, run / METRICS)
     for file in (file for pattern in _DATASET_FILES for file in dataset.glob(pattern)):

@@ -40,6 +40,8 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
         _forget_owner(policy, overrides)
     if policy is None:
         raise ConfigError("No policy was given: say --policy.type=relmm_scripted, or --policy.path=FOLDER_OR_REPO.")
+    if policy.device not in _devices():  # a file's, which LeRobot takes for one of this machine if it begins with cuda
+        policy.device = _devices()[-1]
     return policy
 
 
@@ -71,7 +73,7 @@ def check_camera(policy: PreTrainedConfig, option: str, seen_through: Any) -> No
 
 
 class FreshWeights:
-    """Lets an actor take over the weights of newer checkpoints, while another process trains.
+    """Lets an actor take over the weights of newer checkpoints, while another process trains; damaged ones are refused.
 
     Args:
         actor: loaded from `path`.
@@ -89,6 +91,8 @@ class FreshWeights:
             return None
         from safetensors.torch import load_model
 
+        check_policy_folder(newest)
+        check_weights(self._actor.policy.config, newest)
         load_model(self._actor.policy, newest / "model.safetensors")
         self._loaded = newest
         return newest
@@ -96,14 +100,16 @@ class FreshWeights:
 
 def _check_device(asked: str | None) -> None:
     """Refuse a device that was asked for and is not there; LeRobot would quietly take another one."""
-    if asked is None:
-        return
+    if asked is not None and asked not in _devices():
+        raise ConfigError(f"policy.device is {asked!r}, which this machine does not have: say --policy.device=cpu.")
+
+
+def _devices() -> list[str]:
+    """Those of this machine; the last one is the best."""
     import torch
 
     there = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-    there += ["cuda"] * torch.cuda.is_available() + ["mps"] * torch.backends.mps.is_available()
-    if asked not in there:
-        raise ConfigError(f"policy.device is {asked!r}, which this machine does not have: say --policy.device=cpu.")
+    return there + ["mps"] * torch.backends.mps.is_available() + ["cuda"] * torch.cuda.is_available()
 
 
 def take_seed(config: Any, seed: int) -> None:
@@ -123,11 +129,10 @@ def make_actor(config: PreTrainedConfig) -> Actor:
     config.output_features = {"action": features["action"]}
     path, policy_class = config.pretrained_path, get_policy_class(config.type)
     if path is None:
-        return Actor(policy_class(config=config), *make_pre_post_processors(config))
-    check_policy_folder(Path(path))
-    check_weights(config, Path(path))
-    policy = policy_class.from_pretrained(path, config=config)
-    # The processors were saved with the device of the machine that trained.
-    device = {"device_processor": {"device": config.device}}
-    pre, post = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=device)
-    return Actor(policy, pre, post)
+        policy = policy_class(config=config)
+    else:
+        check_policy_folder(Path(path))
+        check_weights(config, Path(path))
+        policy = policy_class.from_pretrained(path, config=config)
+    # The stored processors say nothing that the config does not; nothing of theirs has to be trusted.
+    return Actor(policy, *make_pre_post_processors(config))

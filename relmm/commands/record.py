@@ -16,6 +16,7 @@ from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
 from relmm.episodes import (
+    MAX_STEPS,
     EpisodeRecorder,
     check_new,
     check_repo_id,
@@ -23,7 +24,7 @@ from relmm.episodes import (
     summarize,
     verify_and_repair,
 )
-from relmm.errors import ConfigError
+from relmm.errors import MANY, MAX_SEED, check_range
 from relmm.learning.actor import Actor
 from relmm.learning.collect import Collector
 from relmm.learning.life import Life
@@ -54,8 +55,7 @@ class RecordDatasetConfig:
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
-        if self.num_episodes < 1:
-            raise ConfigError(f"dataset.num_episodes is {self.num_episodes}, but must be at least 1.")
+        check_range("dataset.num_episodes", self.num_episodes, 1, MANY)
 
     def folder(self) -> Path:
         """The dataset's folder."""
@@ -89,12 +89,9 @@ class RecordConfig:
     def __post_init__(self) -> None:
         self.policy = policy_from_path(self.policy)
         check_camera(self.policy, "robot.camera", self.robot)
-        if self.seed < 0:
-            raise ConfigError(f"seed is {self.seed}, but must not be negative.")
-        if self.max_steps < 1:
-            raise ConfigError(f"max_steps is {self.max_steps}, but must be at least 1.")
-        if self.pseudo_reset_steps < 0:
-            raise ConfigError(f"pseudo_reset_steps is {self.pseudo_reset_steps}, but must not be negative.")
+        check_range("seed", self.seed, 0, MAX_SEED)
+        check_range("max_steps", self.max_steps, 1, MAX_STEPS)
+        check_range("pseudo_reset_steps", self.pseudo_reset_steps, 0, MAX_STEPS)
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:

@@ -34,7 +34,8 @@ from relmm.episodes import (
     verify_and_repair,
 )
 from relmm.episodes.folder import DatasetFolder
-from relmm.episodes.upload import recorded_runs, runs_of
+from relmm.episodes.info import runs_of
+from relmm.episodes.upload import recorded_runs
 from relmm.errors import ConfigError
 from relmm.learning.checkpoint import (
     check_same_networks,
@@ -86,7 +87,7 @@ class Run:
         self.learned = 0  # episodes of the run's dataset that the checkpoint has learned from
         if self.checkpoint is not None:
             counters = load_training_state(self.checkpoint, self.learner, self.rng)
-            self.learned, self.progress.interventions = counters["episodes"], counters["interventions"]
+            self.learned, self.progress.interventions = counters["episodes"], counters.get("interventions", 0)
         assert config.output_dir is not None
         self.uploads = Uploads(run_arguments(config), config.output_dir)
 

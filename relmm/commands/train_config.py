@@ -12,8 +12,8 @@ from lerobot.robots.config import RobotConfig
 from relmm.commands.cli import dated_folder
 from relmm.commands.policies import check_camera, policy_from_path
 from relmm.commands.upload import LICENSE
-from relmm.episodes import check_repo_id
-from relmm.errors import ConfigError
+from relmm.episodes import MAX_STEPS, check_repo_id
+from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
 from relmm.learning.curriculum import CURRICULA
 from relmm.policies.learning import LearningConfig
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
@@ -66,8 +66,7 @@ class HubConfig:
     every: int = 0
 
     def __post_init__(self) -> None:
-        if self.every < 0:
-            raise ConfigError(f"hub.every is {self.every}, but must not be negative; 0 uploads at the end only.")
+        check_range("hub.every", self.every, 0, MANY)
 
 
 @dataclass
@@ -100,10 +99,9 @@ class TrainEvalConfig:
     n_videos: int = 0
 
     def __post_init__(self) -> None:
-        if self.n_episodes < 1:
-            raise ConfigError(f"eval.n_episodes is {self.n_episodes}, but must be at least 1.")
-        if min(self.seed, self.n_videos) < 0:
-            raise ConfigError("eval.seed and eval.n_videos must not be negative.")
+        check_range("eval.n_episodes", self.n_episodes, 1, MANY)
+        check_range("eval.seed", self.seed, 0, MAX_SEED)
+        check_range("eval.n_videos", self.n_videos, 0, MANY)
 
 
 @dataclass
@@ -157,9 +155,8 @@ class TrainConfig:
                 f"relmm-train trains --policy.type=relmm or relmm_paper, not {self.policy.type}: choose one of these, "
                 "or train that one with lerobot-train."
             )
-        for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name} is {getattr(self, name)}, but must be at least {least}.")
+        for name, (low, high) in _RANGES.items():
+            check_range(name, getattr(self, name), low, high)
         if (self.robot is None) == (self.dataset.follow is None):
             if self.resume and self.robot is None and self.output_dir is not None:  # the run would have said it
                 raise ConfigError(
@@ -221,14 +218,14 @@ class TrainConfig:
         return ["policy"]
 
 
-_LEAST = {
-    "steps": 1,
-    "seed": 0,
-    "env_eval_freq": 0,
-    "save_freq": 1,
-    "log_freq": 1,
-    "max_steps": 1,
-    "pseudo_reset_steps": 0,
-    "replay_frames": 1000,
-    "num_threads": 1,
+_RANGES = {
+    "steps": (1, MANY),
+    "seed": (0, MAX_SEED),
+    "env_eval_freq": (0, MANY),
+    "save_freq": (1, MANY),
+    "log_freq": (1, MANY),
+    "max_steps": (1, MAX_STEPS),
+    "pseudo_reset_steps": (0, MAX_STEPS),
+    "replay_frames": (1000, MANY),
+    "num_threads": (1, 256),
 }

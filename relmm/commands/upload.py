@@ -8,7 +8,6 @@ import signal
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from relmm.commands.cli import run
 from relmm.commands.curve import draw_learning_curve
@@ -19,7 +18,7 @@ from relmm.episodes.upload import recorded_runs
 from relmm.errors import ConfigError
 from relmm.learning.checkpoint import last_checkpoint, pretrained_model
 from relmm.learning.hub import CARD, CURVE, METRICS, upload_checkpoint
-from relmm.learning.untrusted import read_json
+from relmm.learning.settings import read_settings
 
 LICENSE = "apache-2.0"
 _NICENESS = 19  # whatever else the machine does comes first
@@ -92,7 +91,8 @@ class UploadConfig:
         if self.dataset.root is not None:
             return self.dataset.root
         assert self.output_dir is not None
-        settings = _settings(last_checkpoint(self.output_dir / "checkpoints", running=True))["dataset"]
+        checkpoint = last_checkpoint(self.output_dir / "checkpoints", running=True)
+        settings = read_settings(pretrained_model(checkpoint))["dataset"]
         root = settings["root"] or settings["follow"]
         return Path(root) if root else self.output_dir / "dataset"
 
@@ -124,7 +124,7 @@ def _upload_policy(config: UploadConfig, checkpoint: Path, dataset: UploadedData
     metrics = config.output_dir / METRICS
     facts = ModelFacts(
         repo_id=config.policy.repo_id,
-        settings=_settings(checkpoint),
+        settings=read_settings(pretrained_model(checkpoint)),
         metrics=metrics,
         dataset=dataset,
         license=config.policy.license or LICENSE,
@@ -149,11 +149,6 @@ def _upload_policy(config: UploadConfig, checkpoint: Path, dataset: UploadedData
 
 def _newest(output_dir: Path | None) -> Path | None:
     return last_checkpoint(output_dir / "checkpoints", running=True) if output_dir else None
-
-
-def _settings(checkpoint: Path) -> dict[str, Any]:
-    settings: dict[str, Any] = read_json(pretrained_model(checkpoint) / "train_config.json")
-    return settings
 
 
 def _url(path: str) -> str:

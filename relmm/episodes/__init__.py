@@ -1,6 +1,6 @@
 """Durable LeRobot datasets: recording, resuming, repairing, counting, reading and following them."""
 
-from relmm.episodes.follow import Episode, EpisodeFollower, read_episodes
+from relmm.episodes.follow import MAX_STEPS, Episode, EpisodeFollower, read_episodes
 from relmm.episodes.frames import FrameBuilder
 from relmm.episodes.hub import local_root
 from relmm.episodes.recorder import EpisodeRecorder
@@ -11,6 +11,7 @@ from relmm.episodes.upload import UploadedDataset, upload_dataset
 from relmm.episodes.writer import DurableDataset
 
 __all__ = [
+    "MAX_STEPS",
     "DatasetSummary",
     "DurableDataset",
     "Episode",

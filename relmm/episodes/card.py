@@ -7,6 +7,7 @@ from typing import Any
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
+from relmm.episodes.info import runs_of
 from relmm.episodes.summary import DatasetSummary, summarize
 from relmm.features import ACTION_NAMES, DATASET_COLUMNS, FPS, JOINT_NAMES, MAX_THETA_VEL, MAX_X_VEL, Phase
 from relmm.geometry import describe_camera
@@ -53,7 +54,7 @@ def dataset_card(folder: DatasetFolder, repo_id: str, license: str, contact_shee
         "## What is in it\n\n" + _counts(summary),
         "## Who acted\n\n" + _who(summary),
         "## Columns\n\n" + _columns(info["features"]),
-        "## How it was recorded\n\n" + _runs(own.get("runs", [])),
+        "## How it was recorded\n\n" + _runs(runs_of(own)),
         "## Use\n\n" + _use(repo_id),
         f"## Licence and citation\n\nLicence: {license}. The method:\n\n{CITATION}",
     ]
@@ -100,7 +101,8 @@ def _columns(features: dict[str, Any]) -> str:
 
 
 def _meaning(key: str, feature: dict[str, Any]) -> str:
-    camera = (feature.get("info") or {}).get("camera")
+    info = feature.get("info")
+    camera = info.get("camera") if isinstance(info, dict) else None
     seen_by = "" if camera is None else f"; camera {describe_camera(camera)}: m in the robot's frame, degrees"
     return DATASET_COLUMNS.get(key, "LeRobot's own") + seen_by
 

@@ -16,8 +16,9 @@ import pyarrow.parquet as pq
 
 from relmm.episodes.exchange import exchange_folder, exchange_folders
 from relmm.episodes.folder import DATA_FILES, INFO, RELMM, TASKS, DatasetFolder, refuse_links
+from relmm.episodes.info import DATA_PATH, read_info
+from relmm.episodes.parquet import read_table
 from relmm.episodes.repair import verify_and_repair
-from relmm.episodes.settings import DATA_PATH
 from relmm.episodes.survey import Survey, survey
 from relmm.errors import DatasetError
 
@@ -42,7 +43,7 @@ def compact(root: Path | str, target: Path) -> int:
         OSError: the copy cannot be written.
     """
     folder = DatasetFolder(root)
-    info = folder.read_json(INFO)
+    info = read_info(folder)
     if info is None:
         raise DatasetError(f"{root} is no LeRobot dataset, it has no readable {INFO}; check the folder.")
     refuse_links(folder.root)
@@ -57,7 +58,7 @@ def compact(root: Path | str, target: Path) -> int:
             shutil.copyfile(folder.root / name, target / name)
     copy = DatasetFolder(target)
     copy.scratch.mkdir()
-    copy.write_json(INFO, info | {"data_path": DATA_PATH, "total_episodes": len(found.episodes)})
+    copy.write_json(INFO, info | {"total_episodes": len(found.episodes)})
     # Counters and statistics may be ahead of the episodes that were there when we looked: made from them again.
     report = verify_and_repair(target)
     assert report.episodes == len(found.episodes)
@@ -88,7 +89,7 @@ def _copy_data(folder: DatasetFolder, found: Survey, info: dict[str, Any], targe
     place, places = (0, 0), {}
     with _Files(target, info["data_files_size_in_mb"] << 20) as files:
         for name, episodes in _by_file(found, info["data_path"]).items():
-            table = pq.read_table(folder.root / name, partitioning=None)
+            table = read_table(folder.root / name)
             if files.is_full_with(folder.root / name):
                 place = update_chunk_file_indices(*place, info["chunks_size"])
             files.open(place, table.schema)
@@ -152,7 +153,7 @@ def _by_file(found: Survey, data_path: str) -> dict[str, list[dict[str, Any]]]:
 
 def _copy_episodes(folder: DatasetFolder, found: Survey, places: dict[int, tuple[int, int]], target: Path) -> None:
     names = [name for name in found.kept_rows if name.startswith("meta/")]
-    tables = [pq.read_table(folder.root / name, partitioning=None).slice(0, found.kept_rows[name]) for name in names]
+    tables = [read_table(folder.root / name).slice(0, found.kept_rows[name]) for name in names]
     table = _concat(tables)
     numbers = table["episode_index"].to_pylist()
     columns = {

@@ -121,7 +121,7 @@ class DatasetFolder:
         """A JSON object of the dataset; None when the file is missing, cut off or something else."""
         try:
             data = json.loads((self.root / name).read_text(encoding="utf-8"))
-        except (FileNotFoundError, NotADirectoryError, ValueError):
+        except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
             return None
         return data if isinstance(data, dict) else None
 

@@ -18,12 +18,16 @@ import pyarrow as pa
 from numpy.typing import DTypeLike, NDArray
 
 from relmm.episodes.folder import EPISODE_FILES, INFO, DatasetFolder
+from relmm.episodes.parquet import are_whole_numbers
 from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
 from relmm.episodes.survey import read_columns, read_places
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_WRONG_TYPES = (ValueError, TypeError, AttributeError, KeyError, pa.ArrowException)  # of columns of other types
+MAX_STEPS = 10_000  # navigation steps of an episode, and of a pseudo-reset before and after it
+_MAX_FRAMES = 5 * MAX_STEPS  # of an episode: they are in memory at once, and a small file may claim any number
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +203,8 @@ class _DataFiles:
         if name != self._name:
             self._name = name
             self._table = read_columns(self._folder.root / name, ["episode_index", "index", *TRAINING_COLUMNS])
+            if self._table is not None and not are_whole_numbers(self._table, ["episode_index", "index"]):
+                self._table = None
         length = row["dataset_to_index"] - row["dataset_from_index"]
         if self._table is None or not 0 < length <= len(self._table):
             return None
@@ -214,13 +220,18 @@ class _DataFiles:
 
     def _episode(self, index: int, frames: pa.Table) -> Episode:
         where = self._folder.root / self._name
+        if len(frames) > _MAX_FRAMES:
+            raise DatasetError(
+                f"episode {index} in {where} has {len(frames)} frames, and at most {_MAX_FRAMES:,} are plausible; "
+                "choose another dataset."
+            )
         try:
             images = _decode(frames[IMAGE_KEY])
-        except (ValueError, cv2.error) as error:
+        except (*_WRONG_TYPES, cv2.error) as error:
             raise DatasetError(f"a picture of episode {index} in {where} cannot be read: {error}.") from error
         try:
             return self._checked(index, images, frames)
-        except (ValueError, pa.ArrowException) as error:
+        except _WRONG_TYPES as error:
             raise DatasetError(f"episode {index} in {where} cannot be learned from: {error}.") from error
 
     def _checked(self, index: int, images: NDArray[np.uint8], frames: pa.Table) -> Episode:

@@ -12,6 +12,8 @@ import pyarrow.parquet as pq
 
 from relmm.episodes.exchange import finish_exchange
 from relmm.episodes.folder import EPISODE_FILES, INFO, RELMM, STATS, TASKS, DatasetFolder
+from relmm.episodes.info import read_info, read_own
+from relmm.episodes.parquet import read_table
 from relmm.episodes.survey import Survey, survey
 from relmm.errors import DatasetError
 
@@ -74,7 +76,7 @@ def verify_and_repair(root: Path | str) -> RepairReport:
 def repair(folder: DatasetFolder) -> RepairReport:
     """`verify_and_repair` for whoever holds the lock."""
     finish_exchange(folder)
-    stored = folder.read_json(INFO)
+    stored = read_info(folder)
     info = stored or _rebuilt_info(folder)
     found = survey(folder, info["data_path"])
     _refuse_hopeless(folder, found, info, info_was_read=stored is not None)
@@ -103,7 +105,7 @@ def _rebuilt_info(folder: DatasetFolder) -> dict[str, Any]:
     from lerobot.datasets.feature_utils import create_empty_dataset_info
     from lerobot.utils.constants import DEFAULT_FEATURES
 
-    own = folder.read_json(RELMM)
+    own = read_own(folder)
     if own is None:
         raise DatasetError(f"{folder.root} has neither a readable {INFO} nor {RELMM}; restore one of them first.")
     features = own["features"] | DEFAULT_FEATURES
@@ -134,7 +136,7 @@ def _describe_strays(found: Survey) -> list[str]:
 
 
 def _keep_first_rows(folder: DatasetFolder, name: str, rows: int) -> None:
-    table = pq.read_table(folder.root / name, partitioning=None)
+    table = read_table(folder.root / name)
     temporary = folder.scratch / name
     temporary.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table.slice(0, rows), temporary, compression="snappy", use_dictionary=True)
@@ -144,9 +146,9 @@ def _keep_first_rows(folder: DatasetFolder, name: str, rows: int) -> None:
 def _repair_tasks(folder: DatasetFolder, found: Survey, report: RepairReport) -> int:
     """Make sure that every task of a whole episode has its name; returns how many tasks there are."""
     try:
-        tasks = pd.read_parquet(folder.root / TASKS)
+        tasks = read_table(folder.root / TASKS).to_pandas()
         known = dict(zip(tasks["task_index"], tasks.index, strict=True))
-    except (OSError, KeyError, pa.ArrowException):
+    except (OSError, KeyError, ValueError, TypeError, pa.ArrowException):
         known = {}
     names = {
         index: name
@@ -186,8 +188,9 @@ def _episode_stats(folder: DatasetFolder) -> list[dict[str, dict[str, Any]]]:
 
     stats: list[dict[str, Any]] = []
     for name in folder.files(EPISODE_FILES):
-        with pq.ParquetFile(folder.root / name) as file:
-            columns = [key for key in file.schema_arrow.names if key.startswith("stats/")]
-            rows = file.read(columns=columns).to_pylist()
-        stats += [{key.removeprefix("stats/"): value for key, value in row.items()} for row in rows]
+        rows = read_table(folder.root / name).to_pylist()
+        stats += [
+            {key.removeprefix("stats/"): value for key, value in row.items() if key.startswith("stats/")}
+            for row in rows
+        ]
     return [cast_stats_to_numpy(episode) for episode in stats]

@@ -9,6 +9,7 @@ from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
+from relmm.episodes.info import DATA_PATH, are_features, runs_of
 from relmm.errors import ConfigError, DatasetError
 from relmm.features import DEPTH_KEY, FPS, IMAGE_KEY, SCAN_NAMES, STATE_KEY, STATE_NAMES, dataset_features
 from relmm.geometry import camera_info, other_camera
@@ -29,7 +30,6 @@ TRAINING_COLUMNS = (
 )
 _STATE_NAMES_0_1_0 = [name for name in STATE_NAMES if name not in ("y.vel", *SCAN_NAMES)]
 FORMAT_VERSION = "v3.0"  # LeRobot's, also the tag of datasets on the Hub
-DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"  # LeRobot's
 
 
 def features_to_store(depth: bool, camera: str | None) -> dict[str, dict[str, Any]]:
@@ -121,7 +121,7 @@ def check_trainable(root: Path | str, camera: str | None = None) -> None:
             columns: each difference is spelled out.
     """
     info = DatasetFolder(root).read_json(INFO) or {}
-    if not {"features", "fps", "codebase_version"} <= info.keys() or not isinstance(info["features"], dict):
+    if not {"features", "fps", "codebase_version"} <= info.keys() or not are_features(info["features"]):
         raise DatasetError(
             f"{root} is no LeRobot dataset, it has no readable {INFO}; choose the folder of a dataset, "
             "or the name of one on the Hub."
@@ -132,7 +132,6 @@ def check_trainable(root: Path | str, camera: str | None = None) -> None:
     if str(info["codebase_version"]).split(".")[0] != FORMAT_VERSION.split(".")[0]:
         differences += _differences("format", info["codebase_version"], FORMAT_VERSION)
     differences += _differences("fps", info["fps"], FPS)
-    # A template is a small program: one from elsewhere could name any file of this machine.
     differences += _differences("data_path", info.get("data_path"), DATA_PATH)
     for key in TRAINING_COLUMNS:
         differences += _differences(f"column {key}", _describe(have.get(key)), _describe(want[key]))
@@ -156,7 +155,7 @@ def add_run(
 
     The file also keeps what `info.json` cannot be rebuilt without.
     """
-    runs = (folder.read_json(RELMM) or {}).get("runs", [])
+    runs = runs_of(folder.read_json(RELMM))
     settings = {
         "robot_type": robot_type,
         "fps": FPS,
@@ -170,7 +169,7 @@ def _stored_settings(folder: DatasetFolder) -> dict[str, Any]:
     if not folder.root.is_dir():
         raise DatasetError(f"there is no dataset at {folder.root}; check the folder, or record without resuming.")
     settings = folder.read_json(INFO) or folder.read_json(RELMM) or {}
-    if not {"features", "fps", "robot_type"} <= settings.keys() or not isinstance(settings["features"], dict):
+    if not {"features", "fps", "robot_type"} <= settings.keys() or not are_features(settings["features"]):
         raise DatasetError(
             f"{folder.root} is no LeRobot dataset, it has no readable {INFO}; choose the folder of a dataset, "
             "or a folder that does not exist yet to record a new one."
@@ -197,8 +196,6 @@ def _feature_differences(have: dict[str, Any], want: dict[str, Any]) -> list[str
 def _describe(feature: Any) -> str:
     if feature is None:
         return "no such column"
-    if not isinstance(feature, dict) or not {"dtype", "shape"} <= feature.keys():
-        return f"no description ({feature!r})"
     names = feature.get("names")
     return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" of {', '.join(map(str, names))}" if names else "")
 

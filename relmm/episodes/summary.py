@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, DatasetFolder
+from relmm.episodes.parquet import read_table
 from relmm.episodes.survey import read_places
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, FPS, Phase, Skill
@@ -107,14 +107,21 @@ def _read(folder: DatasetFolder, files: list[str]) -> dict[str, NDArray[Any]]:
     tables = []
     for name in files:
         try:
-            with pq.ParquetFile(folder.root / name) as file:
-                missing = set(COLUMNS) - set(file.schema_arrow.names)
-                if missing:
-                    raise DatasetError(f"{folder.root} is no relmm dataset, it has no column {min(missing)}.")
-                tables.append(file.read(columns=list(COLUMNS)).replace_schema_metadata())
+            found = read_table(folder.root / name, list(COLUMNS)).replace_schema_metadata()
         except (OSError, pa.ArrowException) as error:
             raise DatasetError(f"{folder.root / name} cannot be read ({error}); repair the dataset first.") from error
-    table = pa.concat_tables(tables)
-    flat = {key: table[key].combine_chunks() for key in COLUMNS}
-    flat["action"] = flat["action"].flatten()
-    return {key: values.to_numpy(zero_copy_only=False) for key, values in flat.items()}
+        missing = set(COLUMNS) - set(found.column_names)
+        if missing:
+            raise DatasetError(f"{folder.root} is no relmm dataset, it has no column {min(missing)}.")
+        tables.append(found)
+    try:
+        table = pa.concat_tables(tables)
+        flat = {key: table[key].combine_chunks() for key in COLUMNS}
+        flat["action"] = flat["action"].flatten()
+        numbers = {key: values.to_numpy(zero_copy_only=False).astype(np.float64) for key, values in flat.items()}
+    except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
+        raise DatasetError(f"{folder.root} is no relmm dataset, its columns are of other types ({error}).") from error
+    whole = len(numbers["action"]) == len(ACTION_NAMES) * len(table) > 0
+    if not whole or not all(np.isfinite(values).all() for values in numbers.values()):
+        raise DatasetError(f"{folder.root} is damaged, numbers are missing or not finite; repair the dataset first.")
+    return numbers

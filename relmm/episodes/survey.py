@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, DatasetFolder
+from relmm.episodes.parquet import are_whole_numbers, read_table
 
 # The columns of meta/episodes that say where an episode is.
 PLACE_COLUMNS = [
@@ -53,10 +53,13 @@ class Survey:
 
 
 def read_columns(path: Path, columns: list[str]) -> pa.Table | None:
-    """Columns of a parquet file; None when it is missing, cut off, or lacks one of them."""
+    """Columns of a parquet file; None when it is missing, cut off, or lacks one of them.
+
+    Raises:
+        DatasetError: it unpacks to more than any recording does.
+    """
     try:
-        with pq.ParquetFile(path) as file:
-            table = file.read(columns=columns, use_threads=False)
+        table = read_table(path, columns)
     except (OSError, pa.ArrowException):
         return None
     return table if len(table.column_names) == len(columns) else None
@@ -65,11 +68,7 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table | None:
 def read_places(path: Path) -> pa.Table | None:
     """`PLACE_COLUMNS` of a file of meta/episodes; None also where they are not whole numbers."""
     table = read_columns(path, PLACE_COLUMNS)
-    if table is None:
-        return None
-    numbers = [table[name] for name in PLACE_COLUMNS[:-1]]
-    whole = all(pa.types.is_integer(column.type) and column.null_count == 0 for column in numbers)
-    return table if whole else None
+    return table if table is not None and are_whole_numbers(table, PLACE_COLUMNS[:-1]) else None
 
 
 def survey(folder: DatasetFolder, data_path: str) -> Survey:
@@ -143,7 +142,9 @@ class _DataFiles:
         if name not in self._columns:
             wanted = ["episode_index", "index", "task_index"]
             table = read_columns(self._folder.root / name, wanted)
-            self._columns[name] = None if table is None else np.stack([table[key].to_numpy() for key in wanted])
+            self._columns[name] = None
+            if table is not None and are_whole_numbers(table, wanted):
+                self._columns[name] = np.stack([table[key].to_numpy() for key in wanted])
         return self._columns[name]
 
 

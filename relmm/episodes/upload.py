@@ -12,6 +12,7 @@ from relmm.episodes.card import CONTACT_SHEET, dataset_card
 from relmm.episodes.compact import compact
 from relmm.episodes.contact_sheet import draw_contact_sheet
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
+from relmm.episodes.info import runs_of
 from relmm.episodes.remote import move_tag, push_folder
 from relmm.episodes.settings import FORMAT_VERSION, check_repo_id, check_trainable
 from relmm.errors import DatasetError, HubError
@@ -116,9 +117,3 @@ def refuse_other_runs(repo: str, own: list[dict[str, Any]], theirs: list[dict[st
 def recorded_runs(folder: DatasetFolder) -> list[dict[str, Any]]:
     """With what a dataset was recorded, run by run; equal beginnings mean the same dataset."""
     return runs_of(folder.read_json(RELMM))
-
-
-def runs_of(relmm: Any) -> list[dict[str, Any]]:
-    """The runs in the content of a `meta/relmm.json`, none if it is not one."""
-    runs = relmm.get("runs", []) if isinstance(relmm, dict) else []
-    return runs if isinstance(runs, list) else []

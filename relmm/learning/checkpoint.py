@@ -2,6 +2,7 @@
 
     checkpoints/<step>/pretrained_model/   the policy and its processors; what --policy.path takes
     checkpoints/<step>/training_state/     optimisers, random states, counters and the dataset cursor
+    checkpoints/<step>/*/SHA256SUMS        check sums of the files beside it; `train_config.json` may change
     checkpoints/last                       a link to the newest
 
 The replay is not in there: the dataset is the replay.
@@ -12,6 +13,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +22,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from relmm.episodes.folder import sync
-from relmm.errors import ConfigError
+from relmm.errors import MANY, ConfigError, DiskError
 from relmm.learning.actor import Actor
+from relmm.learning.moments import load_moments
+from relmm.learning.settings import SETTINGS
+from relmm.learning.sums import check_sums, write_sums
+from relmm.learning.untrusted import check_tensors, read_json
 from relmm.policies.learning import Learner
 
 _MODEL, _STATE, _LAST = "pretrained_model", "training_state", "last"
@@ -28,6 +35,24 @@ STEP = "training_step.json"  # LeRobot's
 _COUNTERS, _RANDOM = "relmm_state.json", "relmm_rng.safetensors"
 
 
+def _says_what_cannot_be_written[**P, R](save: Callable[P, R]) -> Callable[P, R]:
+    """Safetensors has an error of its own where the disk is full."""
+
+    @wraps(save)
+    def saving(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return save(*args, **kwargs)
+        except (OSError, SafetensorError) as error:
+            why = getattr(error, "strerror", None) or " ".join(str(error).split())
+            raise DiskError(
+                f"The checkpoint cannot be written to {args[0]} ({why}), the last one is still whole; make room or "
+                "check the permissions, then go on with --resume=true."
+            ) from error
+
+    return saving
+
+
+@_says_what_cannot_be_written
 def save_checkpoint(
     folder: Path,
     step: int,
@@ -52,6 +77,9 @@ def save_checkpoint(
 
     Returns:
         The checkpoint's folder.
+
+    Raises:
+        DiskError: it cannot be written.
     """
     from lerobot.optim import save_optimizer_state
 
@@ -59,12 +87,14 @@ def save_checkpoint(
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     actor.save_pretrained(temporary / _MODEL)
-    _write_json(temporary / _MODEL / "train_config.json", config)
+    _write_json(temporary / _MODEL / SETTINGS, config)
     save_optimizer_state(learner.optimizers, temporary / _STATE)
     _write_json(temporary / _STATE / STEP, {"step": step})
     states = {"trainer": rng.bit_generator.state, "learner": learner.rng.bit_generator.state}
     _write_json(temporary / _STATE / _COUNTERS, {"counters": counters, "random": states, "runs": runs})
     save_file({"noise": learner.noise.get_state()}, temporary / _STATE / _RANDOM)
+    write_sums(temporary / _MODEL, leave_out=(SETTINGS,))  # which becomes portable on its way to the Hub
+    write_sums(temporary / _STATE)
     _sync_tree(temporary)
     if target.exists():  # the same step again: the link must never point to what is being removed
         _link(folder / _LAST, temporary.name)
@@ -114,23 +144,6 @@ def training_state(checkpoint: Path) -> Path:
     return checkpoint / _STATE
 
 
-def portable_config(config: dict[str, Any]) -> dict[str, Any]:
-    """A run's settings without what belongs to one machine or person: folders, and where it is uploaded to.
-
-    Args:
-        config: content of a `train_config.json`, perhaps from elsewhere.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    policy, dataset = config.get("policy"), config.get("dataset")
-    if not isinstance(policy, dict) or not isinstance(dataset, dict):
-        raise ConfigError("train_config.json has no settings of policy and dataset; use another checkpoint.")
-    policy = {**policy, "push_to_hub": False, "repo_id": None, "private": None, "pretrained_path": None}
-    dataset = {**dataset, "push_to_hub": False, "private": None, "root": None}
-    return {**config, "policy": policy, "dataset": dataset, "hub": {}, "output_dir": None, "resume": False}
-
-
 def install_checkpoint(folder: Path, step: int, model: Path, names: list[str]) -> None:
     """Make `folder/<step>` of a downloaded checkpoint, and point `folder/last` to it.
 
@@ -151,7 +164,7 @@ def install_checkpoint(folder: Path, step: int, model: Path, names: list[str]) -
 
 def read_training_state(checkpoint: Path) -> dict[str, Any]:
     """Counters, random states, and with what the dataset was recorded, as `save_checkpoint` wrote them."""
-    state: dict[str, Any] = json.loads((checkpoint / _STATE / _COUNTERS).read_text(encoding="utf-8"))
+    state: dict[str, Any] = read_json(checkpoint / _STATE / _COUNTERS)
     return state
 
 
@@ -161,34 +174,24 @@ def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[st
     Raises:
         ConfigError: the checkpoint is of a policy with other networks, or damaged.
     """
-    from lerobot.optim import load_optimizer_state
-
+    check_sums(checkpoint / _STATE)
+    load_moments(learner.optimizers, checkpoint / _STATE)
+    check_tensors(checkpoint / _STATE / _RANDOM, {"noise": learner.noise.get_state()})
+    state = read_training_state(checkpoint)
     try:
-        load_optimizer_state(learner.optimizers, checkpoint / _STATE)
-        _check_optimizers(learner)
-        state = read_training_state(checkpoint)
         learner.noise.set_state(load_file(checkpoint / _STATE / _RANDOM)["noise"])
         rng.bit_generator.state = state["random"]["trainer"]
         learner.rng.bit_generator.state = state["random"]["learner"]
         counters: dict[str, Any] = {key: _count(key, value) for key, value in state["counters"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, SafetensorError) as error:
+        counters["episodes"]  # which training goes on from
+    except Exception as error:  # numpy, torch and safetensors refuse what does not fit with errors of any kind
         reason = " ".join(str(error).split())
         raise ConfigError(f"The training state in {checkpoint} cannot be read ({reason}); resume another.") from error
     return counters
 
 
-def _check_optimizers(learner: Learner) -> None:
-    """Torch takes any state for an optimiser, and fails, or learns nonsense, at its first step."""
-    for name, optimizer in learner.optimizers.items():
-        for group in optimizer.param_groups:
-            for weight in group["params"]:
-                for key, value in optimizer.state[weight].items():
-                    if not value.isfinite().all() or (value.ndim and value.shape != weight.shape):
-                        raise ValueError(f"{key} of the optimiser of {name} does not fit its weight")
-
-
 def _count(name: str, value: Any) -> int:
-    if not isinstance(value, int) or value < 0:
+    if type(value) is not int or not 0 <= value <= MANY:
         raise ValueError(f"{name} is {value!r} and counts something")
     return value
 
@@ -221,7 +224,9 @@ def check_same_networks(checkpoint: Path, wanted: dict[str, Any]) -> None:
     Raises:
         ConfigError: with the differences.
     """
-    have = json.loads((checkpoint / _MODEL / "config.json").read_text(encoding="utf-8"))
+    have = read_json(checkpoint / _MODEL / "config.json")
+    if not isinstance(have, dict):
+        raise ConfigError(f"The config.json in {checkpoint / _MODEL} has no settings; resume another.")
     differences = [f"{key} is {have.get(key)}, not {value}" for key, value in wanted.items() if have.get(key) != value]
     if differences:
         raise ConfigError(

@@ -18,23 +18,24 @@ from typing import Any
 
 from relmm.episodes import UploadedDataset, check_repo_id
 from relmm.episodes.folder import refuse_links
+from relmm.episodes.info import runs_of
 from relmm.episodes.remote import download, push_folder, reason
-from relmm.episodes.upload import refuse_other_runs, runs_of
-from relmm.errors import ConfigError, HubError
-from relmm.learning.checkpoint import STEP, portable_config, pretrained_model, training_state
-from relmm.learning.progress import Progress, read_metrics
+from relmm.episodes.upload import refuse_other_runs
+from relmm.errors import MANY, ConfigError, HubError
+from relmm.learning.checkpoint import STEP, pretrained_model, training_state
+from relmm.learning.settings import SETTINGS, portable_settings
+from relmm.learning.sums import SUMS
 from relmm.learning.untrusted import CONFIG, WEIGHTS, check_policy_folder, read_json
 
-_EVALUATION, _HUGE = {"eval_collected_std", "eval_collected_each"}, 1e15
 METRICS, CURVE, CARD = "metrics.jsonl", "learning_curve.png", "README.md"
 _DATASET = "training_state/dataset.json"
-_TRAIN_CONFIG = "train_config.json"
 _PROCESSOR_FILES = ("policy_*.json", "policy_*.safetensors")
 # What is taken from a repository, and the largest plausible sizes in bytes.
 POLICY_FILES = {
     CONFIG: 1 << 20,
-    _TRAIN_CONFIG: 1 << 20,
+    SETTINGS: 1 << 20,
     WEIGHTS: 2 << 30,
+    SUMS: 1 << 20,
     **dict.fromkeys(_PROCESSOR_FILES, 10 << 20),
 }
 _CHECKPOINT_FILES = {**POLICY_FILES, "training_state/*": 4 << 30, METRICS: 1 << 30}
@@ -88,7 +89,7 @@ def upload_checkpoint(
     check_repo_id(repo_id)
     refuse_links(checkpoint)
     check_policy_folder(pretrained_model(checkpoint))
-    step = read_json(training_state(checkpoint) / STEP)["step"]
+    step = _read_step(training_state(checkpoint) / STEP)
     source = Source(step, None, None, 0, runs)
     if dataset is not None:
         source = replace(source, repo_id=dataset.repo_id, revision=dataset.revision, episodes=dataset.episodes)
@@ -107,7 +108,7 @@ def upload_checkpoint(
             repo_id,
             "model",
             private=private,
-            replaces=["*.json", "*.safetensors"],
+            replaces=["*.json", "*.safetensors", f"*{SUMS}"],
             check=_refuse_others(repo_id, source),
             message=f"{step} navigation steps",
         )
@@ -116,8 +117,8 @@ def upload_checkpoint(
 def _stage(checkpoint: Path, source: Source, folder: Path) -> None:
     shutil.copytree(pretrained_model(checkpoint), folder, dirs_exist_ok=True)
     shutil.copytree(training_state(checkpoint), folder / "training_state")
-    config = portable_config(read_json(folder / _TRAIN_CONFIG))
-    (folder / _TRAIN_CONFIG).write_text(json.dumps(config, indent=4), encoding="utf-8")
+    config = portable_settings(read_json(folder / SETTINGS))
+    (folder / SETTINGS).write_text(json.dumps(config, indent=4), encoding="utf-8")
     (folder / _DATASET).write_text(json.dumps(asdict(source), indent=4), encoding="utf-8")
 
 
@@ -176,35 +177,20 @@ def fetch_checkpoint(repo_id: str, revision: str) -> tuple[Path, Source]:
     """
     folder = _download(repo_id, revision, _CHECKPOINT_FILES)
     check_policy_folder(folder)
-    if not (folder / _DATASET).is_file() or not (folder / _TRAIN_CONFIG).is_file():
+    if not (folder / _DATASET).is_file() or not (folder / SETTINGS).is_file():
         raise ConfigError(
             f"the model {repo_id} on the Hub has no {_DATASET}, so training cannot go on from it; "
             f"begin a run with its weights: leave out --resume=true."
         )
-    if (folder / METRICS).is_file():
-        _check_metrics(folder / METRICS)
     return folder, _read_source(folder / _DATASET)
 
 
-def _check_metrics(path: Path) -> None:
-    """The run's clock, curve and card are made from them."""
-    try:
-        plausible = all(map(_is_plausible, read_metrics(path)))
-    except (UnicodeDecodeError, RecursionError):
-        plausible = False
-    if not plausible:
-        raise ConfigError(f"{path} has lines that are no metrics of a run; use another checkpoint.")
-
-
-def _is_plausible(line: object) -> bool:
-    if not isinstance(line, dict):
-        return False
-    evaluation = _EVALUATION if "eval_collected" in line else set()
-    each = line.get("eval_collected_each", [])
-    if not isinstance(each, list) or not {*Progress().asdict(), "seconds", *evaluation} <= line.keys():
-        return False
-    numbers = [*(value for name, value in line.items() if name != "eval_collected_each"), *each]
-    return all(type(number) in (int, float) and abs(number) < _HUGE for number in numbers)
+def _read_step(path: Path) -> int:
+    content = read_json(path)
+    step = content.get("step") if isinstance(content, dict) else None
+    if type(step) is not int or not 0 <= step <= MANY:
+        raise ConfigError(f"{path} does not say how many steps the checkpoint has; use another checkpoint.")
+    return step
 
 
 def _read_source(path: Path) -> Source:
@@ -212,9 +198,9 @@ def _read_source(path: Path) -> Source:
     try:
         source = Source(**content)
         plausible = (
-            isinstance(source.step, int)
-            and 0 <= source.step < 10**12
-            and isinstance(source.episodes, int)
+            type(source.step) is type(source.episodes) is int
+            and 0 <= source.step <= MANY
+            and 0 <= source.episodes <= MANY
             and isinstance(source.runs, list)
             and all(isinstance(name, str | None) for name in (source.repo_id, source.revision))
         )

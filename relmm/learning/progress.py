@@ -76,6 +76,10 @@ class Progress:
         return asdict(self)
 
 
+_COUNTS = Progress().asdict().keys()
+_EVALUATION, _HUGE = {"eval_collected_std", "eval_collected_each", "eval_grasp_success"}, 1e15
+
+
 class Metrics:
     """A `metrics.jsonl`: one JSON object a line, on the disk when `write` returns.
 
@@ -89,7 +93,7 @@ class Metrics:
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("a", encoding="utf-8")
-        self.seconds = max((line.get("seconds", 0.0) for line in read_metrics(path)), default=0.0)
+        self.seconds = max((line["seconds"] for line in read_metrics(path)), default=0.0)
         written = path.read_bytes()
         if written and not written.endswith(b"\n"):  # a killed run may have left half a line
             self._file.write("\n")
@@ -107,11 +111,25 @@ class Metrics:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a `metrics.jsonl`; half a line that a killed run has left is skipped."""
+    """The lines of a `metrics.jsonl`; what is no metrics, such as half a line of a killed run, is skipped."""
     lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in path.read_bytes().splitlines():
         try:
-            lines.append(json.loads(line))
-        except ValueError:
+            values = json.loads(line)
+        except (ValueError, RecursionError):
             continue
+        if _is_plausible(values):
+            lines.append(values)
     return lines
+
+
+def _is_plausible(line: object) -> bool:
+    """Whether a line is what `Metrics.write` is given; the run's clock, curve and card are made from it."""
+    if not isinstance(line, dict):
+        return False
+    evaluation = _EVALUATION if "eval_collected" in line else set()
+    each = line.get("eval_collected_each", [])
+    if not isinstance(each, list) or not {*_COUNTS, "seconds", *evaluation} <= line.keys():
+        return False
+    numbers = [*(value for name, value in line.items() if name != "eval_collected_each"), *each]
+    return all(type(number) in (int, float) and abs(number) < _HUGE for number in numbers)

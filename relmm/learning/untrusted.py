@@ -6,6 +6,8 @@ LeRobot would import whatever class a processor's JSON names, load weights that 
 from __future__ import annotations
 
 import json
+import math
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,17 +19,22 @@ from torch import Tensor
 
 from relmm.errors import ConfigError
 from relmm.features import dataset_features
+from relmm.learning.sums import check_sums
 from relmm.policies.controller import ControllerConfig
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-_STEPS = {
-    "rename_observations_processor",
-    "to_batch_processor",
-    "device_processor",
-    "normalizer_processor",
-    "unnormalizer_processor",
+# The steps of a processor, and what their settings must be, so that they change neither pictures nor actions.
+_ANY = object()
+_NORMALIZER = {"eps": _ANY, "features": _ANY, "norm_map": dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")}
+_STEPS: dict[str, dict[str, Any]] = {
+    "rename_observations_processor": {"rename_map": {}},
+    "to_batch_processor": {},
+    "device_processor": {"device": _ANY, "float_dtype": None},
+    "normalizer_processor": _NORMALIZER,
+    "unnormalizer_processor": _NORMALIZER,
 }
+_LARGEST_WEIGHT = 1e3  # far above those of trained networks; 1e30 is finite, but what it is multiplied with is not
 _MAX_JSON = 10 << 20
 _TYPES = {"F32": torch.float32, "F64": torch.float64, "I64": torch.int64, "U8": torch.uint8, "BOOL": torch.bool}
 
@@ -45,9 +52,9 @@ def check_policy_folder(folder: Path) -> None:
     known = PreTrainedConfig.get_known_choices()
     own = sorted(name for name, choice in known.items() if issubclass(choice, ControllerConfig))
     if not isinstance(config, dict) or config.get("type") not in own:
-        kind = config.get("type") if isinstance(config, dict) else config
+        kind = reprlib.repr(config.get("type") if isinstance(config, dict) else config)
         raise ConfigError(
-            f"{folder / CONFIG} is of a policy {kind!r}, and relmm's commands load {', '.join(own)}; "
+            f"{folder / CONFIG} is of a policy {kind}, and relmm's commands load {', '.join(own)}; "
             "use lerobot-eval for policies of others."
         )
     refuse_first_version(config, folder / CONFIG)
@@ -55,6 +62,7 @@ def check_policy_folder(folder: Path) -> None:
         _check_processor(folder / name, read_json(folder / name))
     if not (folder / WEIGHTS).is_file():
         raise ConfigError(f"{folder} has no {WEIGHTS}: give the folder of a checkpoint's pretrained_model.")
+    check_sums(folder)
 
 
 def refuse_first_version(config: Mapping[str, Any], path: Path) -> None:
@@ -97,14 +105,40 @@ def _check_processor(path: Path, pipeline: Any) -> None:
     if not isinstance(steps, list):
         raise ConfigError(f"{path} describes no processor, it has no list of steps; use another checkpoint.")
     for step in steps:
-        if not isinstance(step, dict) or step.get("registry_name") not in _STEPS or "class" in step:
-            name = (step.get("class") or step.get("registry_name")) if isinstance(step, dict) else step
+        name = (step.get("class") or step.get("registry_name")) if isinstance(step, dict) else step
+        if not isinstance(step, dict) or not isinstance(name, str) or name not in _STEPS or "class" in step:
             raise ConfigError(
-                f"{path} has a step {name!r}, and policies of relmm have {', '.join(sorted(_STEPS))}; do not use it."
+                f"{path} has a step {reprlib.repr(name)}, and policies of relmm have {', '.join(sorted(_STEPS))}; do "
+                "not use it."
             )
-        file = step.get("state_file")
-        if file is not None and (not isinstance(file, str) or Path(file).name != file or Path(file).is_absolute()):
-            raise ConfigError(f"{path} names the file {file!r}, which is not in its folder; do not use it.")
+        _check_step(path, name, step.get("config", {}))
+        if (file := step.get("state_file")) is not None:
+            _check_state(path, file)
+
+
+def _check_step(path: Path, name: str, settings: Any) -> None:
+    """Refuse what would rename pictures or change numbers; relmm's commands make the steps anew, LeRobot's do not."""
+    allowed = _STEPS[name]
+    items = settings.items() if isinstance(settings, dict) else [("config", settings)]
+    for key, value in items:
+        if key not in allowed or allowed[key] not in (_ANY, value):
+            raise ConfigError(
+                f"{path} has a step {name} with the setting {reprlib.repr(key)}: {reprlib.repr(value)}, which no "
+                "policy of relmm has; do not use it."
+            )
+
+
+def _check_state(path: Path, name: Any) -> None:
+    """Refuse statistics that are elsewhere or not finite; with the only allowed settings nobody uses them."""
+    if not isinstance(name, str) or Path(name).name != name:
+        raise ConfigError(f"{path} names the file {reprlib.repr(name)}, which is not in its folder; do not use it.")
+    try:
+        with safe_open(path.parent / name, framework="pt") as file:
+            finite = all(file.get_tensor(key).isfinite().all() for key in file.keys())  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise _unreadable(path.parent / name, error) from error
+    if not finite:
+        raise ConfigError(f"{path.parent / name} has numbers that are not finite; use another checkpoint.")
 
 
 def check_features(config: PreTrainedConfig, folder: Path) -> None:
@@ -118,7 +152,7 @@ def check_features(config: PreTrainedConfig, folder: Path) -> None:
     wanted = dataset_to_policy_features(dataset_features())
     have = {**(config.input_features or {}), **(config.output_features or {})}
     for key, feature in have.items():
-        if key not in wanted or tuple(feature.shape) != tuple(wanted[key].shape):
+        if key not in wanted or (feature.type, tuple(feature.shape)) != (wanted[key].type, tuple(wanted[key].shape)):
             there = tuple(wanted[key].shape) if key in wanted else "nothing of that name"
             raise ConfigError(
                 f"{folder / CONFIG} expects {key} of {tuple(feature.shape)}, and relmm has {there}; use another "
@@ -130,17 +164,22 @@ def check_weights(config: PreTrainedConfig, folder: Path) -> None:
     """Refuse weights that do not fit the config, before any memory is taken for them.
 
     Raises:
-        ConfigError: no safetensors, cut off, other keys or shapes, or numbers that are not finite.
+        ConfigError: no safetensors, cut off, other keys or shapes, or numbers that are not finite or far too large.
     """
     from lerobot.policies.factory import get_policy_class
 
     with torch.device("meta"):  # shapes without memory: the config may claim gigabytes
         expected = get_policy_class(config.type)(config=config).state_dict()
-    check_tensors(folder / WEIGHTS, expected)
+    check_tensors(folder / WEIGHTS, expected, _LARGEST_WEIGHT)
 
 
-def check_tensors(path: Path, expected: Mapping[str, Tensor]) -> None:
+def check_tensors(path: Path, expected: Mapping[str, Tensor], largest: float = math.inf) -> None:
     """Refuse a safetensors file with anything but the expected names, types, shapes, and finite numbers.
+
+    Args:
+        path: of the file.
+        expected: tensors of those names, types and shapes.
+        largest: magnitude of a number with a fraction.
 
     Raises:
         ConfigError: with the first difference.
@@ -151,15 +190,21 @@ def check_tensors(path: Path, expected: Mapping[str, Tensor]) -> None:
             for name, tensor in expected.items():
                 _check_like(path, name, file.get_slice(name), tensor)
             for name in expected:
-                if not torch.isfinite(file.get_tensor(name)).all():
-                    raise ConfigError(f"{path} has numbers in {name} that are not finite; use another checkpoint.")
-    except (SafetensorError, OSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(
-            f"{path} is cut off, or no safetensors file ({' '.join(str(error).split())}); use another checkpoint, or "
-            "download it again."
-        ) from error
+                tensor = file.get_tensor(name)
+                if not tensor.isfinite().all() or (tensor.is_floating_point() and (tensor.abs() > largest).any()):
+                    raise ConfigError(
+                        f"{path} has numbers in {name} that are not finite, or above {largest:g}; use another "
+                        "checkpoint."
+                    )
+    except (SafetensorError, OSError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> ConfigError:
+    return ConfigError(
+        f"{path} is cut off, or no safetensors file ({' '.join(str(error).split())}); use another checkpoint, or "
+        "download it again."
+    )
 
 
 def _check_names(path: Path, have: set[str], want: set[str]) -> None:

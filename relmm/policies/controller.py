@@ -24,7 +24,7 @@ from lerobot.processor import (
 from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
 from numpy.typing import NDArray
 
-from relmm.errors import ConfigError
+from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
 from relmm.features import (
     ACTION_NAMES,
     BASKET_XY,
@@ -70,10 +70,13 @@ class ControllerConfig(PreTrainedConfig):
         self.output_features: dict[str, PolicyFeature] = self.output_features or {
             "action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))
         }
-        if self.num_grasp < 1:
-            raise ConfigError(f"policy.num_grasp is {self.num_grasp}, but must be at least 1.")
-        if self.seed is not None and self.seed < 0:
-            raise ConfigError(f"policy.seed is {self.seed}, but must not be negative.")
+        check_range("policy.num_grasp", self.num_grasp, 1, MANY)
+        check_range("policy.seed", self.seed or 0, 0, MAX_SEED)
+        if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:
+            raise ConfigError(
+                "policy.normalization_mapping must be IDENTITY throughout, for relmm's policies take raw pictures; "
+                "leave it out."
+            )
 
     @property
     def observation_delta_indices(self) -> list[int] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from relmm.errors import ConfigError
+from relmm.errors import MANY, check_range
 from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES, Phase, Skill
 from relmm.geometry import camera_geometry
 from relmm.policies.controller import ControllerConfig, ControllerPolicy, Row
@@ -44,21 +43,18 @@ class LearningConfig(ControllerConfig):
 
     # The range of each number, low and high, both allowed; subclasses add their own.
     ranges: ClassVar[dict[str, tuple[float, float]]] = {
-        "num_stationary": (1, math.inf),
-        "min_attempts_to_update": (1, math.inf),
-        "num_start": (1, math.inf),
-        "num_stop": (1, math.inf),
-        "num_max": (1, math.inf),
+        "num_stationary": (1, MANY),
+        "min_attempts_to_update": (1, MANY),
+        "num_start": (1, MANY),
+        "num_stop": (1, MANY),
+        "num_max": (1, MANY),
     }
 
     def __post_init__(self) -> None:
         super().__post_init__()
         camera_geometry(self.camera)
         for name, (low, high) in self.ranges.items():
-            value = getattr(self, name)
-            if not (math.isfinite(value) and low <= value <= high):
-                upper = "" if high == math.inf else f" and at most {high:g}"
-                raise ConfigError(f"policy.{name} is {value}, but must be at least {low:g}{upper}.")
+            check_range(f"policy.{name}", getattr(self, name), low, high)
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:

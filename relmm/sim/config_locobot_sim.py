@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from lerobot.robots.config import RobotConfig
 
+from relmm.errors import MAX_SEED, check_range
 from relmm.geometry import camera_geometry
 from relmm.sim.rooms import Room, make_room
 
@@ -33,6 +34,7 @@ class LocobotSimConfig(RobotConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         camera_geometry(self.camera)
+        check_range("robot.seed", self.seed or 0, 0, MAX_SEED)
         self.make_room().scatter(np.random.default_rng(0))  # says now if the objects do not fit
 
     def make_room(self) -> Room:

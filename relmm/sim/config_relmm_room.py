@@ -10,7 +10,7 @@ import gymnasium as gym
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from relmm.errors import ConfigError
+from relmm.errors import MANY, check_range
 from relmm.features import ACTION_NAMES, FRONT, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 
@@ -83,8 +83,7 @@ class RelmmRoomEnvConfig(EnvConfig):
     )
 
     def __post_init__(self) -> None:
-        if self.navigation_steps < 1:
-            raise ConfigError(f"env.navigation_steps is {self.navigation_steps}, but must be at least 1.")
+        check_range("env.navigation_steps", self.navigation_steps, 1, MANY)
         LocobotSimConfig(room=self.room, num_objects=self.num_objects, camera=self.camera)
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:

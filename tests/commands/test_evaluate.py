@@ -123,7 +123,7 @@ def test_evaluate_interrupted_says_so(capsys, monkeypatch, tmp_path):
         ("--env.room=no_such_room", "no_obstacles"),
         ("--env.navigation_steps=0", "must be at least 1"),
         ("--eval.n_episodes=0", "must be at least 1"),
-        ("--eval.n_videos=-1", "must not be negative"),
+        ("--eval.n_videos=-1", "must be at least 0"),
         ("--env.type=pusht", "relmm_room"),
         ("--env.camera=d435", "say --env.camera=paper, or --policy.camera=d435"),
         ("--policy.path=/nowhere/at/all", "No policy can be loaded from '/nowhere/at/all'"),

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load, save
 
 from relmm.commands import evaluate, record, train, upload
-from relmm.commands.policies import make_actor
+from relmm.commands.policies import make_actor, policy_from_path
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 WEIGHTS = "model.safetensors"
@@ -115,6 +115,30 @@ DAMAGES: dict[str, tuple[Callable[[dict[str, bytes]], object], str]] = {
         "has a step 'subprocess.Popen'",
     ),
     "foreign step": (changed_step(registry_name="tokenizer_processor"), "has a step 'tokenizer_processor'"),
+    "renamed pictures": (
+        changed_step(config={"rename_map": {"observation.state": "action"}}),
+        "the setting 'rename_map'",
+    ),
+    "half precision": (changed_step(registry_name="device_processor", config={"float_dtype": "float16"}), "'float16'"),
+    "other numbers": (
+        changed_step(registry_name="normalizer_processor", config={"norm_map": {"STATE": "MEAN_STD"}}),
+        "the setting 'norm_map'",
+    ),
+    "NaN in statistics": (
+        lambda files: (
+            changed_step(state_file="stats.safetensors")(files),
+            files.update({"stats.safetensors": save({"action.mean": torch.tensor(float("nan"))})}),
+        ),
+        "stats.safetensors has numbers that are not finite",
+    ),
+    "no statistics": (changed_step(state_file="stats.safetensors"), "stats.safetensors is cut off, or no safetensors"),
+    "normalization": (
+        changed_config(normalization_mapping={"STATE": "MEAN_STD"}),
+        "normalization_mapping must be IDENT",
+    ),
+    "huge batches": (changed_config(batch_size=10**23), "policy.batch_size is 1000"),
+    "huge seed": (changed_config(seed=10**23), "policy.seed is 1000"),
+    "no device": (changed_config(device="../.."), "No policy can be loaded"),
     "file elsewhere": (changed_step(state_file="../../secret.safetensors"), "which is not in its folder"),
     "absolute file": (changed_step(state_file="/etc/passwd"), "which is not in its folder"),
     "no processor": (lambda files: files.pop("policy_preprocessor.json"), "has no policy_preprocessor.json"),
@@ -124,6 +148,7 @@ DAMAGES: dict[str, tuple[Callable[[dict[str, bytes]], object], str]] = {
     "wrong shape": (changed_weights(lambda t: t.update({first(t): torch.zeros(3, 3)})), "is torch.float32 (3, 3), not"),
     "wrong type": (changed_weights(lambda t: t.update({first(t): t[first(t)].double()})), "is torch.float64"),
     "NaN": (changed_weights(lambda t: t[first(t)].fill_(float("nan"))), "that are not finite"),
+    "huge weights": (changed_weights(lambda t: t[first(t)].fill_(1e30)), "that are not finite, or above 1000"),
     "truncated": (lambda files: files.update({WEIGHTS: files[WEIGHTS][:-1000]}), "is cut off, or no safetensors"),
     "10 GB claimed": (replaced(WEIGHTS, header_claims(10 << 30)), "is cut off, or no safetensors"),
     "10 GB of header": (replaced(WEIGHTS, struct.pack("<Q", 10 << 30) + b"{}"), "is cut off, or no safetensors"),
@@ -179,6 +204,15 @@ def test_policies_of_the_first_version_on_the_hub_are_refused(hub, first_version
     hub.create("me/old", files={path.name: path.read_bytes() for path in model.iterdir()})
     assert OF_FIRST_VERSION in refused(evaluate.main, "--policy.path=me/old")
     assert OF_FIRST_VERSION in refused(train.main, "--resume=true", "--policy.path=me/old")
+
+
+def test_a_device_of_another_machine_is_not_used(tmp_path, policy, monkeypatch):
+    changed_config(device="cuda:99")(policy)
+    for name, content in policy.items():
+        (tmp_path / name).write_bytes(content)
+    monkeypatch.setattr("lerobot.configs.policies.is_torch_device_available", lambda device: True)
+    monkeypatch.setattr(sys, "argv", ["command", f"--policy.path={tmp_path}"])
+    assert policy_from_path(None).device in ("cpu", "cuda", "mps")
 
 
 @pytest.mark.parametrize("name", ["code in a processor", "NaN", "another class"])

@@ -14,7 +14,9 @@ from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 
 COUNTS = {"attempts": 40, "successes": 10, "objects": 7, "pseudo_reset_steps": 120, "interventions": 3} | {
-    "robot_minutes": 12.3
+    "robot_minutes": 12.3,
+    "practice_attempts": 0,
+    "seconds": 9.0,
 }
 LINES = [
     {"steps": 50, **COUNTS, "grasp_loss": 0.5},

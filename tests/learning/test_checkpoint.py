@@ -1,6 +1,7 @@
 """Checkpoints: what is saved comes back, and a crash at any moment leaves the last one whole."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from relmm.commands.policies import make_actor
-from relmm.errors import ConfigError
+from relmm.errors import ConfigError, DiskError
 from relmm.features import STATE_NAMES, Phase, Skill
 from relmm.learning import checkpoint as module
 from relmm.learning.checkpoint import (
@@ -21,6 +22,7 @@ from relmm.learning.checkpoint import (
     pretrained_model,
     save_checkpoint,
 )
+from relmm.learning.untrusted import check_policy_folder
 from relmm.policies.learning import Learner, LearningConfig
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
@@ -153,10 +155,42 @@ def test_checkpoint_of_other_networks_is_refused(tmp_path, kind):
 
 def test_damaged_training_state_is_one_sentence(tmp_path):
     actor, learner = make_learner()
-    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {}, {}, [])
+    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {"episodes": 0}, {}, [])
     (folder / "training_state" / "relmm_state.json").write_text("{", encoding="utf-8")
-    with pytest.raises(ConfigError, match="resume another"):
+    with pytest.raises(ConfigError, match=r"'relmm_state\.json' is not what SHA256SUMS says"):
         load_training_state(folder, learner, np.random.default_rng(0))
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_the_last_checkpoint(tmp_path):
+    """Whatever file is the first that does not fit."""
+    actor, learner = make_learner()
+    work(learner, 1)
+    save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {"episodes": 1}, {})
+    sizes = {path.stat().st_size for path in (tmp_path / "000001").rglob("*") if path.is_file()}
+    previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond the limit then fails with EFBIG
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        for size in sizes:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, hard))
+            with pytest.raises(DiskError, match="make room") as caught:
+                save_checkpoint(tmp_path, 2, actor, learner, np.random.default_rng(0), {"episodes": 2}, {})
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            assert "\n" not in str(caught.value)
+            assert last_checkpoint(tmp_path).name == "000001"
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, previous)
+    save_checkpoint(tmp_path, 2, actor, learner, np.random.default_rng(0), {"episodes": 2}, {})
+    assert load_training_state(last_checkpoint(tmp_path), learner, np.random.default_rng(0)) == {"episodes": 2}
+
+
+def test_a_checkpoint_without_check_sums_still_loads(tmp_path):
+    actor, learner = make_learner()
+    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {"episodes": 1}, {})
+    for sums in folder.rglob("SHA256SUMS"):
+        sums.unlink()
+    check_policy_folder(pretrained_model(folder))
+    assert load_training_state(folder, learner, np.random.default_rng(0)) == {"episodes": 1}
 
 
 def test_no_checkpoint_is_one_sentence(tmp_path):

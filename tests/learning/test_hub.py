@@ -5,14 +5,22 @@ import re
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load, save
 
 from relmm.commands.policies import make_actor
 from relmm.episodes import UploadedDataset
 from relmm.errors import ConfigError, HubError
-from relmm.learning.checkpoint import install_checkpoint, last_checkpoint, load_training_state, save_checkpoint
+from relmm.learning.checkpoint import (
+    install_checkpoint,
+    last_checkpoint,
+    load_training_state,
+    save_checkpoint,
+)
 from relmm.learning.hub import fetch_checkpoint, fetch_policy, upload_checkpoint
-from relmm.learning.progress import Progress
+from relmm.learning.settings import portable_settings
+from relmm.learning.sums import SUMS
+from relmm.learning.untrusted import check_policy_folder
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 NAME = "me/policy"
@@ -89,6 +97,64 @@ def test_what_belongs_to_one_machine_stays_there(hub, save_step):
     assert (settings["dataset"]["push_to_hub"], settings["hub"]) == (False, {})
 
 
+def test_a_flipped_bit_is_noticed(hub, save_step):
+    def load(checkpoint):
+        check_policy_folder(checkpoint / "pretrained_model")
+        load_training_state(checkpoint, small_learner()[1], np.random.default_rng())
+
+    checkpoint = save_step(7)
+    push(checkpoint)
+    for file in sorted(checkpoint.rglob("*")):
+        if file.is_file() and file.name != "train_config.json":
+            content = file.read_bytes()
+            middle = len(content) // 2
+            file.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+            with pytest.raises(ConfigError) as caught:
+                load(checkpoint)
+            assert "\n" not in str(caught.value)
+            file.write_bytes(content)
+    repo = hub.repo(NAME)
+    weights = bytearray(repo.files["model.safetensors"])
+    weights[-1] ^= 1
+    repo.commit(repo.files | {"model.safetensors": bytes(weights)})
+    with pytest.raises(ConfigError, match=r"is damaged: 'model\.safetensors' is not what SHA256SUMS says"):
+        fetch_policy(NAME)
+
+
+def test_a_learning_rate_is_the_runs_own(save_step):
+    """Whatever the file says: 1e30 would make NaN of all weights at the first step."""
+    checkpoint = save_step(7)
+    (checkpoint / "training_state" / SUMS).unlink()
+    groups = checkpoint / "training_state/grasping/optimizer_param_groups.json"
+    for value in ("NaN", "1e30", "[" * 100_000):
+        groups.write_text(re.sub(r'"lr": [^,]*,', f'"lr": {value},', groups.read_text()))
+        _, learner = small_learner()
+        before = learner.optimizers["grasping"].param_groups[0] | {"params": None}
+        load_training_state(checkpoint, learner, np.random.default_rng())
+        assert learner.optimizers["grasping"].param_groups[0] | {"params": None} == before
+
+
+def test_settings_from_elsewhere_name_no_file_and_no_device():
+    evil = {
+        "policy": {"type": "relmm", "updates": 3, "device": "cuda:7", "path": "you/evil", "pretrained_path": "/etc"},
+        "dataset": {"repo_id": "me/life", "root": "/etc", "follow": "/etc", "init": "/home/me/other", "license": "mit"},
+        "robot": {"type": "locobot_sim", "room": "diverse", "calibration_dir": "/etc", "port": "/dev/ttyUSB0"},
+        "job_name": "../../evil",
+        "output_dir": "/etc",
+        "num_threads": 100_000,
+        "steps": 20,
+    }
+    settings = portable_settings(evil)
+    assert not re.search(r"/etc|/dev|/home|\.\.|evil|cuda|100000", json.dumps(settings))
+    assert (settings["steps"], settings["policy"]["updates"], settings["robot"]["room"]) == (20, 3, "diverse")
+    assert (settings["dataset"]["repo_id"], settings["dataset"]["license"]) == ("me/life", "mit")
+    evil["dataset"]["init"] = "me/first@main"
+    assert portable_settings(evil)["dataset"]["init"] == "me/first@main"
+    for bad in ([], None, "", {"policy": []}, {"policy": {}, "dataset": {}, "robot": "x"}):
+        with pytest.raises(ConfigError, match="has no settings of policy, dataset and robot"):
+            portable_settings(bad)
+
+
 def test_later_checkpoints_replace_earlier_ones(hub, save_step):
     first = push(save_step(7))
     second = push(save_step(9))
@@ -146,25 +212,51 @@ def tensors_with(change):
     return damage
 
 
+def moment(key, change):
+    """Another moment of the first weight."""
+
+    def damage(content):
+        tensors = load(content)
+        tensors[f"state/0/{key}"] = change(tensors[f"state/0/{key}"])
+        return save(tensors)
+
+    return damage
+
+
+OTHER = "moments of weight 0 that no gradients have"
 DAMAGES = {
-    "shape": (ADAM, tensors_with(lambda t: t[:1].contiguous()), "does not fit its weight"),
-    "NaN": (ADAM, tensors_with(lambda t: t * float("nan")), "does not fit its weight"),
+    "shape": (ADAM, tensors_with(lambda t: t[:1].contiguous()), "does not fit its config"),
+    "NaN": (ADAM, tensors_with(lambda t: t * float("nan")), "that are not finite"),
+    "huge": (ADAM, moment("exp_avg", lambda t: t * 1e30), OTHER),
+    "tiny square": (ADAM, moment("exp_avg_sq", lambda t: t * 0), OTHER),
+    "negative square": (ADAM, moment("exp_avg_sq", lambda t: -t), OTHER),
+    "before the first step": (ADAM, moment("step", lambda t: t - 2), OTHER),
+    "half of them": (
+        ADAM,
+        lambda content: save({k: v for k, v in load(content).items() if k[-4:] != "step"}),
+        "missing",
+    ),
+    "more": (ADAM, lambda content: save(load(content) | {"state/99/step": torch.zeros(())}), "too many"),
     "cut": (ADAM, lambda content: content[:-10], "cannot be read"),
     "missing": (ADAM, None, "cannot be read"),
     "counters": (STATE, json_with(counters={"episodes": -1}), "episodes is -1"),
+    "huge counters": (STATE, json_with(counters={"episodes": 10**23}), "episodes is 1000"),
     "no counters": (STATE, json_with(counters=[]), "cannot be read"),
+    "no cursor": (STATE, json_with(counters={"interventions": 1}), "cannot be read"),
     "generator": (
         STATE,
         json_with(random={"trainer": {"bit_generator": "os.system"}, "learner": {}}),
         "cannot be read",
     ),
-    "nonsense": (STATE, lambda content: b"nonsense", "cannot be read"),
+    "nonsense": (STATE, lambda content: b"nonsense", "no JSON that can be read"),
+    "deep": (STATE, lambda content: b"[" * 100_000, "no JSON that can be read"),
 }
 
 
 @pytest.mark.parametrize(("name", "damage", "words"), DAMAGES.values(), ids=DAMAGES)
 def test_damaged_training_state(save_step, name, damage, words):
     path = save_step(7) / name
+    (save_step(7) / "training_state" / SUMS).unlink()  # which would notice any of them
     if damage is None:
         path.unlink()
     else:
@@ -184,32 +276,4 @@ def test_nonsense_about_the_dataset(hub, save_step, content):
     repo = hub.repo(NAME)
     repo.commit(repo.files | {"training_state/dataset.json": content})
     with pytest.raises(ConfigError, match=re.escape("does not say what the checkpoint was trained on")):
-        fetch_checkpoint(NAME, "main")
-
-
-LINE = json.dumps(Progress().asdict()).encode()[:-1] + b', "seconds": '
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"[]",
-        b'"steps"',
-        b'{"steps": 1}',
-        LINE + b'"long"}',
-        LINE + b"NaN}",
-        LINE + b'1, "eval_collected": 0.5}',
-        LINE + b'1, "eval_collected_std": 0, "eval_collected_each": [], "eval_collected": ["much"]}',
-        b"\xff\xfe",
-        b"[" * 100_000,
-    ],
-)
-def test_nonsense_in_the_metrics(hub, save_step, content):
-    push(save_step(7))
-    repo = hub.repo(NAME)
-    healthy = LINE + b'2.5, "eval_collected": 0.5, "eval_collected_std": 0.1, "eval_collected_each": [0.4, 0.6]}\n'
-    repo.commit(repo.files | {"metrics.jsonl": healthy})
-    fetch_checkpoint(NAME, "main")
-    repo.commit(repo.files | {"metrics.jsonl": healthy + content + b"\n"})
-    with pytest.raises(ConfigError, match="has lines that are no metrics of a run"):
         fetch_checkpoint(NAME, "main")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,11 @@ from relmm.features import ACTION_NAMES, Phase, Skill, action_dict
 from relmm.learning.progress import Metrics, Progress, read_metrics
 
 Frame = tuple[Skill, bool, Phase, float]  # the last is s on the robot's clock
+
+
+def line(steps: int, seconds: float = 0.0) -> dict[str, float]:
+    """A line of metrics."""
+    return {**Progress(steps=steps).asdict(), "seconds": seconds}
 
 
 def live(progress: Progress, *frames: Frame) -> Progress:
@@ -76,8 +82,8 @@ def test_metrics_are_read_as_written_and_appended_to(tmp_path: Path) -> None:
     path = tmp_path / "run" / "metrics.jsonl"
     for step in (1, 2):
         metrics = Metrics(path)
-        metrics.write(steps=step, loss=step / 3)
-        assert read_metrics(path)[-1] == {"steps": step, "loss": pytest.approx(step / 3, abs=1e-5)}
+        metrics.write(**line(step), loss=step / 3)
+        assert read_metrics(path)[-1] == {**line(step), "loss": pytest.approx(step / 3, abs=1e-5)}
         metrics.close()
     assert [line["steps"] for line in read_metrics(path)] == [1, 2]
 
@@ -87,14 +93,43 @@ def test_metrics_of_a_resumed_run_know_how_long_it_has_trained(tmp_path: Path) -
     for before, after in ((0.0, 4.5), (4.5, 7.0), (7.0, 7.5)):
         metrics = Metrics(path)
         assert metrics.seconds == before
-        metrics.write(steps=1, seconds=after)
+        metrics.write(**line(1, after))
         metrics.close()
 
 
 def test_half_a_line_of_a_killed_run_costs_that_line_alone(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
-    path.write_text('{"steps": 1}\n{"steps": 2, "lo', encoding="utf-8")
+    path.write_text(json.dumps(line(1)) + '\n{"steps": 2, "lo', encoding="utf-8")
     metrics = Metrics(path)
-    metrics.write(steps=3)
+    metrics.write(**line(3))
     metrics.close()
-    assert read_metrics(path) == [{"steps": 1}, {"steps": 3}]
+    assert read_metrics(path) == [line(1), line(3)]
+
+
+BEGIN = json.dumps(line(1)).encode()[:-1]
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        b"[]",
+        b'"steps"',
+        b'{"steps": 1}',
+        BEGIN + b', "seconds": "long"}',
+        BEGIN + b', "loss": NaN}',
+        BEGIN + b', "loss": 1' + b"0" * 400 + b"}",
+        BEGIN + b', "eval_collected": 0.5}',
+        BEGIN + b', "eval_collected_std": 0, "eval_collected_each": [], "eval_collected": ["much"]}',
+        b"\xff\xfe",
+        b"[" * 100_000,
+    ],
+)
+def test_what_is_no_metrics_of_a_run_is_skipped(tmp_path: Path, nonsense: bytes) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(
+        json.dumps(line(1)).encode() + b"\n" + nonsense + b"\n" + json.dumps(line(2, 7.5)).encode() + b"\n"
+    )
+    assert read_metrics(path) == [line(1), line(2, 7.5)]
+    metrics = Metrics(path)
+    metrics.close()
+    assert metrics.seconds == 7.5

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.optim.optimizers import AdamConfig
 
+from relmm.errors import MANY
 from relmm.policies.learning import LearningConfig
 
 _TINY = 1e-8
@@ -70,16 +71,16 @@ class ReLMMConfig(LearningConfig):
         "channels": (1, 1024),
         "initial_logit": (-20, 20),
         "prior_scale": (0, 20),
-        "mean_weight": (0, math.inf),
-        "std_weight": (0, math.inf),
-        "gate_std_weight": (0, math.inf),
+        "mean_weight": (0, MANY),
+        "std_weight": (0, MANY),
+        "gate_std_weight": (0, MANY),
         "grasp_threshold": (0, 1),
         "learning_rate": (_TINY, 1),
-        "batch_size": (1, math.inf),
-        "updates": (0, math.inf),
+        "batch_size": (1, 1 << 16),
+        "updates": (0, MANY),
         "smoothing": (0, 0.5),
         "recolor": (0, 1),
-        "failure_steps": (_TINY, math.inf),
+        "failure_steps": (_TINY, MANY),
         "unseen_promise": (0, 1),
     }
 

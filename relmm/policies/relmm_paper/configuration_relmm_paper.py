@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.optim.optimizers import AdamConfig
 
-from relmm.errors import ConfigError
+from relmm.errors import MANY, ConfigError
 from relmm.policies.learning import LearningConfig
 
 NAVIGATION_ENCODERS = ("paper", "paper_small")
@@ -89,24 +89,24 @@ class RelmmPaperConfig(LearningConfig):
         **LearningConfig.ranges,
         "num_members": (1, 100),
         "grasp_channels": (1, 1024),
-        "mean_weight": (0, math.inf),
-        "std_weight": (0, math.inf),
-        "gate_mean_weight": (0, math.inf),
-        "gate_std_weight": (0, math.inf),
+        "mean_weight": (0, MANY),
+        "std_weight": (0, MANY),
+        "gate_mean_weight": (0, MANY),
+        "gate_std_weight": (0, MANY),
         "grasp_threshold": (0, 1),
         "grasp_learning_rate": (_TINY, 1),
-        "grasp_batch_size": (1, math.inf),
-        "grasp_updates": (0, math.inf),
+        "grasp_batch_size": (1, 1 << 16),
+        "grasp_updates": (0, MANY),
         "navigation_hidden": (1, 4096),
         "navigation_learning_rate": (_TINY, 1),
-        "navigation_batch_size": (1, math.inf),
-        "navigation_updates": (0, math.inf),
-        "random_steps": (0, math.inf),
-        "min_steps_to_update": (1, math.inf),
+        "navigation_batch_size": (1, 1 << 16),
+        "navigation_updates": (0, MANY),
+        "random_steps": (0, MANY),
+        "min_steps_to_update": (1, MANY),
         "gamma": (_TINY, 0.9999),
         "tau": (_TINY, 1),
         "target_entropy": (-100, 100),
-        "initial_temperature": (_TINY, math.inf),
+        "initial_temperature": (_TINY, MANY),
     }
 
     def __post_init__(self) -> None:

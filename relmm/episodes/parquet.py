@@ -1,0 +1,73 @@
+"""Reading parquet files that may come from anybody: a small one may unpack to more than there is memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from relmm.errors import DatasetError
+
+# What is plausible in memory: pictures are PNGs and stay as they are, and little else is in a recording.
+_PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO = 64 << 20, 8
+_ROWS_AT_ONCE = 256
+
+
+def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Columns of a parquet file.
+
+    Args:
+        path: of the file.
+        columns: None for all; those that the file does not have are left out.
+
+    Raises:
+        OSError, pa.ArrowException: it is missing, cut off, or no parquet file.
+        DatasetError: it unpacks to more than any recording does.
+    """
+    limit = _PLAUSIBLE_BYTES + _PLAUSIBLE_RATIO * path.stat().st_size
+    with pq.ParquetFile(path) as file:
+        wanted = [name for name in file.schema_arrow.names if columns is None or name in columns]
+        for name in wanted:
+            _refuse_dictionaries(path, file.schema_arrow.field(name))
+        size, batches = _claimed_bytes(file.metadata, wanted), []
+        _refuse(path, size, limit)
+        size = 0
+        # A claim may be false, and a value that is stored once may be repeated: what really comes is counted, too.
+        for batch in file.iter_batches(_ROWS_AT_ONCE, columns=wanted, use_threads=False):
+            size += batch.nbytes
+            _refuse(path, size, limit)
+            batches.append(batch)
+        schema = batches[0].schema if batches else file.schema_arrow.empty_table().select(wanted).schema
+    return pa.Table.from_batches(batches, schema).combine_chunks()
+
+
+def are_whole_numbers(table: pa.Table, columns: list[str]) -> bool:
+    """Whether columns hold whole numbers throughout."""
+    return all(pa.types.is_integer(table[name].type) and table[name].null_count == 0 for name in columns)
+
+
+def _refuse_dictionaries(path: Path, field: pa.Field) -> None:
+    """They are small in memory until somebody looks at them."""
+    if pa.types.is_dictionary(field.type):
+        raise DatasetError(f"{path} has values by number in {field.name!r}, which no recording has; do not use it.")
+    for index in range(field.type.num_fields):
+        _refuse_dictionaries(path, field.type.field(index))
+
+
+def _claimed_bytes(metadata: pq.FileMetaData, columns: list[str]) -> int:
+    """Of the file's own word, before anything is unpacked."""
+    size = 0
+    for group in (metadata.row_group(index) for index in range(metadata.num_row_groups)):
+        for column in (group.column(index) for index in range(group.num_columns)):
+            if any(column.path_in_schema == name or column.path_in_schema.startswith(f"{name}.") for name in columns):
+                size += max(column.total_uncompressed_size, column.num_values)
+    return size
+
+
+def _refuse(path: Path, size: int, limit: int) -> None:
+    if size > limit:
+        raise DatasetError(
+            f"{path} has {path.stat().st_size / 1e6:.1f} MB and unpacks to {size / 1e6:.0f} MB or more, which no "
+            "recording does; do not use it."
+        )
