@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, DatasetFolder
+from relmm.episodes.outcomes import DERIVED, SOURCES, with_outcomes
 from relmm.episodes.survey import read_places
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, FPS, Phase, Skill
@@ -108,13 +109,15 @@ def _read(folder: DatasetFolder, files: list[str]) -> dict[str, NDArray[Any]]:
     for name in files:
         try:
             with pq.ParquetFile(folder.root / name) as file:
-                missing = set(COLUMNS) - set(file.schema_arrow.names)
+                names = set(file.schema_arrow.names)
+                missing = set(COLUMNS) - names - set(DERIVED)
                 if missing:
                     raise DatasetError(f"{folder.root} is no relmm dataset, it has no column {min(missing)}.")
-                tables.append(file.read(columns=list(COLUMNS)).replace_schema_metadata())
+                wanted = COLUMNS if names.issuperset(COLUMNS) else {*COLUMNS, *SOURCES} & names
+                tables.append(file.read(columns=list(wanted)).replace_schema_metadata())
         except (OSError, pa.ArrowException) as error:
             raise DatasetError(f"{folder.root / name} cannot be read ({error}); repair the dataset first.") from error
-    table = pa.concat_tables(tables)
+    table, _ = with_outcomes(pa.concat_tables(tables))
     flat = {key: table[key].combine_chunks() for key in COLUMNS}
     flat["action"] = flat["action"].flatten()
     return {key: values.to_numpy(zero_copy_only=False) for key, values in flat.items()}

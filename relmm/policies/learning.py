@@ -170,6 +170,14 @@ class Learner(ABC):
         self.save_episode()
 
 
+def no_rewards() -> ConfigError:
+    """What to say of batches without `next.reward`: single frames do not tell whether the grasp worked."""
+    return ConfigError(
+        "The dataset has no column next.reward, and lerobot-train shows a policy no frame together with the next one, "
+        "which would tell whether a grasp worked: learn from this dataset by relmm-train --dataset.init=FOLDER_OR_REPO."
+    )
+
+
 class LearningPolicy(ControllerPolicy):
     """A policy that a trainer can train.
 
