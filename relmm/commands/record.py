@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,13 +26,16 @@ from relmm.episodes import (
     summarize,
     verify_and_repair,
 )
-from relmm.errors import MANY, MAX_SEED, check_range
+from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
 from relmm.learning.actor import Actor
-from relmm.learning.collect import Collector
+from relmm.learning.collect import Cleaner, Collector
 from relmm.learning.life import Life
 from relmm.robot.locobot import LocobotRobot
+from relmm.sim.locobot_sim import LocobotSim
 
-_COLLECTOR_STREAM = 2  # keeps the pseudo-resets' random numbers apart from others drawn from the same seed
+# Keep the random numbers of the pseudo-resets and of the rooms apart from others drawn from the same seed.
+_COLLECTOR_STREAM, _ROOMS_STREAM = 2, 3
+MODES = ("practice", "clean")
 
 
 @dataclass
@@ -72,15 +77,18 @@ class RecordConfig:
         robot: `--robot.type=locobot_sim --robot.room=...`.
         dataset: where the episodes go.
         policy: who acts.
+        mode: `practice`: what is picked up is put down elsewhere, an episode ends with it, and there are no resets, to
+            learn to grasp from; `clean`: an episode is one room that is cleaned into the basket, to imitate.
         seed: of everything random; the same seed records the same dataset.
         resume: continue the dataset in its folder.
         max_steps: navigation steps after which an episode is cut off.
-        pseudo_reset_steps: navigation steps, at most, before and after a picked-up object is put down again.
+        pseudo_reset_steps: of `practice`: navigation steps, at most, before and after a picked-up object is put down.
     """
 
     robot: RobotConfig
     dataset: RecordDatasetConfig
     policy: PreTrainedConfig | None = None
+    mode: str = "practice"
     seed: int = 0
     resume: bool = False
     max_steps: int = 250
@@ -89,6 +97,8 @@ class RecordConfig:
     def __post_init__(self) -> None:
         self.policy = policy_from_path(self.policy)
         check_camera(self.policy, "robot.camera", self.robot)
+        if self.mode not in MODES:
+            raise ConfigError(f"mode is {self.mode!r}, but must be one of {', '.join(MODES)}.")
         check_range("seed", self.seed, 0, MAX_SEED)
         check_range("max_steps", self.max_steps, 1, MAX_STEPS)
         check_range("pseudo_reset_steps", self.pseudo_reset_steps, 0, MAX_STEPS)
@@ -144,7 +154,7 @@ def _recorder(config: RecordConfig, root: Path, robot: LocobotRobot) -> EpisodeR
         save_unfinished=True,
         depth="front_depth" in robot.observation_features,
         robot_type=robot.name,
-        info={**info, "policy": policy.type, "policy_path": parser.get_path_arg("policy") or ""},
+        info={**info, "policy": policy.type, "policy_path": parser.get_path_arg("policy") or "", "mode": config.mode},
     )
 
 
@@ -156,8 +166,7 @@ def _collect(
     seed: int,
     signals: StopOnSignal,
 ) -> None:
-    life = Life(robot, [recorder], robot.seconds, config.max_steps, should_stop=lambda: signals.stopped)
-    collector = Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
+    collector = _collector(config, robot, actor, recorder, seed, lambda: signals.stopped)
     assert config.policy is not None
     fresh = FreshWeights(actor, config.policy.pretrained_path)
     frames = successes = grasps = 0
@@ -166,9 +175,31 @@ def _collect(
             if (checkpoint := fresh.take()) is not None:
                 bar.write(f"acting by {checkpoint}")
             result = collector.episode()
-            frames, grasps, successes = frames + result.frames, grasps + result.grasps, successes + result.success
+            frames, grasps, successes = frames + result.frames, grasps + result.grasps, successes + result.picked_up
             bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, refresh=False)
             bar.update()
+
+
+def _collector(
+    config: RecordConfig,
+    robot: LocobotRobot,
+    actor: Actor,
+    recorder: EpisodeRecorder,
+    seed: int,
+    should_stop: Callable[[], bool],
+) -> Collector | Cleaner:
+    practice = config.mode == "practice"
+    to_collect = None if practice else robot.body.room.num_objects if isinstance(robot, LocobotSim) else math.inf
+    life = Life(robot, [recorder], robot.seconds, config.max_steps, should_stop, to_collect)
+    if practice:
+        return Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
+    rooms = np.random.default_rng([seed, _ROOMS_STREAM])
+
+    def set_up() -> None:
+        if isinstance(robot, LocobotSim):  # else a person does it
+            robot.reset(int(rooms.integers(2**31)))
+
+    return Cleaner(life, actor, set_up)
 
 
 def main() -> None:

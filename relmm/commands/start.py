@@ -61,6 +61,7 @@ relmm-record: record a robot's life as a LeRobot dataset.
   --dataset.root=FOLDER         where it goes; else where LeRobot keeps datasets
   --dataset.num_episodes=N      to record in this run
   --dataset.push_to_hub=true    upload it at the end
+  --mode=practice               or clean: an episode is one room that is cleaned into the basket
   --max_steps=250               navigation steps after which an episode is cut off
   --pseudo_reset_steps=20       steps, at most, before and after an object is put down again
   --seed=0                      of everything random

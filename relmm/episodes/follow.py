@@ -18,6 +18,7 @@ import pyarrow as pa
 from numpy.typing import DTypeLike, NDArray
 
 from relmm.episodes.folder import EPISODE_FILES, INFO, DatasetFolder
+from relmm.episodes.outcomes import with_outcomes
 from relmm.episodes.parquet import are_whole_numbers
 from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
 from relmm.episodes.survey import read_columns, read_places
@@ -39,7 +40,7 @@ class Episode:
         images: (n, 100, 100, 3) uint8, RGB.
         states: (n, len(STATE_NAMES)) float32, units as in `relmm.features`.
         actions: (n, 5) float32, what was done, by `relmm.features.ACTION_NAMES`.
-        rewards: (n,) float32, 1 where the frame's grasp picked something up.
+        rewards: (n,) float32, 1 where the frame's grasp picked something up; see `relmm.episodes.outcomes`.
         dones: (n,) bool, ended with a success.
         truncated: (n,) bool, ended at the step limit.
         phases: (n,) int64, a `relmm.features.Phase` each.
@@ -118,7 +119,7 @@ class EpisodeFollower:
         self.problem = ""
         self._folder = DatasetFolder(root)
         self._camera = camera
-        self._data_path = self._find_data_path()
+        self._data = self._find_data()
         # By file of meta/episodes: which one it was when it was read, and the number of its last episode.
         self._last_episodes: dict[str, tuple[int, int]] = {}
 
@@ -133,11 +134,11 @@ class EpisodeFollower:
     def read_new(self) -> Iterator[Episode]:
         """As `poll`, with one episode at a time in memory."""
         self.problem = ""
-        if self._data_path is None:
-            self._data_path = self._find_data_path()
-        if self._data_path is None:
+        if self._data is None:
+            self._data = self._find_data()
+        if self._data is None:
             return
-        data = _DataFiles(self._folder, self._data_path)
+        data = _DataFiles(self._folder, *self._data)
         for row in self._new_rows():
             episode = data.read(row) if row["episode_index"] == self.next else None
             if episode is None:
@@ -146,12 +147,14 @@ class EpisodeFollower:
             self.next += 1
             yield episode
 
-    def _find_data_path(self) -> str | None:
+    def _find_data(self) -> tuple[str, list[str]] | None:
+        """LeRobot's template for data files, and the columns to read."""
         info = self._folder.read_json(INFO)
         if info is None:
             return None
         check_trainable(self._folder.root, self._camera)
-        return str(info["data_path"])
+        columns = [name for name in TRAINING_COLUMNS if name in info["features"]]
+        return str(info["data_path"]), ["episode_index", "index", *columns]
 
     def _new_rows(self) -> Iterator[dict[str, Any]]:
         """Rows of meta/episodes from episode `next` on; reads each file when it is needed."""
@@ -191,9 +194,8 @@ class EpisodeFollower:
 class _DataFiles:
     """Reads episodes from the data files; LeRobot puts several into one file when it edits a dataset."""
 
-    def __init__(self, folder: DatasetFolder, data_path: str) -> None:
-        self._folder = folder
-        self._data_path = data_path
+    def __init__(self, folder: DatasetFolder, data_path: str, columns: list[str]) -> None:
+        self._folder, self._data_path, self._columns = folder, data_path, columns
         self._name = ""
         self._table: pa.Table | None = None  # the file of the last episode, its pictures still compressed
 
@@ -202,7 +204,7 @@ class _DataFiles:
         name = self._data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
         if name != self._name:
             self._name = name
-            self._table = read_columns(self._folder.root / name, ["episode_index", "index", *TRAINING_COLUMNS])
+            self._table = read_columns(self._folder.root / name, self._columns)
             if self._table is not None and not are_whole_numbers(self._table, ["episode_index", "index"]):
                 self._table = None
         length = row["dataset_to_index"] - row["dataset_from_index"]
@@ -230,6 +232,9 @@ class _DataFiles:
         except (*_WRONG_TYPES, cv2.error) as error:
             raise DatasetError(f"a picture of episode {index} in {where} cannot be read: {error}.") from error
         try:
+            frames, known = with_outcomes(frames)
+            if not known[-1] and len(frames) > 1:  # it teaches nothing, and would count as a failure
+                images, frames = images[:-1], frames.slice(0, len(frames) - 1)
             return self._checked(index, images, frames)
         except _WRONG_TYPES as error:
             raise DatasetError(f"episode {index} in {where} cannot be learned from: {error}.") from error
@@ -255,7 +260,7 @@ def _numbers(column: pa.ChunkedArray, dtype: DTypeLike) -> NDArray[Any]:
     if pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
         values = values.flatten()
     numbers = values.to_numpy(zero_copy_only=False).astype(dtype)
-    if len(numbers) % len(column) or not np.isfinite(numbers).all():
+    if len(numbers) % max(len(column), 1) or not np.isfinite(numbers).all():
         raise ValueError("it has numbers that are missing or not finite")
     return numbers
 

@@ -10,24 +10,15 @@ from huggingface_hub.utils import validate_repo_id
 
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
 from relmm.episodes.info import DATA_PATH, are_features, runs_of
+from relmm.episodes.outcomes import DERIVED
 from relmm.errors import ConfigError, DatasetError
 from relmm.features import DEPTH_KEY, FPS, IMAGE_KEY, SCAN_NAMES, STATE_KEY, STATE_NAMES, dataset_features
 from relmm.geometry import camera_info, other_camera
 
 # The columns that LeRobot adds by itself.
 LEROBOT_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-# The columns that learning reads.
-TRAINING_COLUMNS = (
-    IMAGE_KEY,
-    STATE_KEY,
-    "action",
-    "next.reward",
-    "next.done",
-    "next.truncated",
-    "complementary_info.phase",
-    "complementary_info.grasp_probability",
-    "complementary_info.robot_time",
-)
+# The columns that learning reads; of `DERIVED` those that there are.
+TRAINING_COLUMNS = (IMAGE_KEY, STATE_KEY, "action", *(name for name in DERIVED if name != "next.success"))
 _STATE_NAMES_0_1_0 = [name for name in STATE_NAMES if name not in ("y.vel", *SCAN_NAMES)]
 FORMAT_VERSION = "v3.0"  # LeRobot's, also the tag of datasets on the Hub
 
@@ -110,15 +101,15 @@ def check_resume(
 def check_trainable(root: Path | str, camera: str | None = None) -> None:
     """Refuse a dataset that relmm cannot learn from; reads `info.json` only, so it may have any number of episodes.
 
-    More columns than `TRAINING_COLUMNS` are welcome.
+    More columns than `TRAINING_COLUMNS` are welcome, and any frame rate: a frame is one skill, however long it took.
 
     Args:
         root: the dataset.
         camera: that of the policy, None for any; a dataset that does not tell its own may have it.
 
     Raises:
-        DatasetError: no LeRobot dataset, of relmm 0.1.0, of another camera, or of another format, frame rate or
-            columns: each difference is spelled out.
+        DatasetError: no LeRobot dataset, of relmm 0.1.0, of another camera, or of another format or columns:
+            each difference is spelled out.
     """
     info = DatasetFolder(root).read_json(INFO) or {}
     if not {"features", "fps", "codebase_version"} <= info.keys() or not are_features(info["features"]):
@@ -131,14 +122,15 @@ def check_trainable(root: Path | str, camera: str | None = None) -> None:
     differences = []
     if str(info["codebase_version"]).split(".")[0] != FORMAT_VERSION.split(".")[0]:
         differences += _differences("format", info["codebase_version"], FORMAT_VERSION)
-    differences += _differences("fps", info["fps"], FPS)
     differences += _differences("data_path", info.get("data_path"), DATA_PATH)
     for key in TRAINING_COLUMNS:
+        if key in DERIVED and key not in have:
+            continue
         differences += _differences(f"column {key}", _describe(have.get(key)), _describe(want[key]))
     if differences:
         raise DatasetError(
-            f"{root} cannot be trained on: {'; '.join(differences)}; choose a dataset that relmm has recorded, "
-            "or record one with relmm-record."
+            f"{root} cannot be trained on: {'; '.join(differences)}; choose a dataset of relmm-record, or of "
+            "lerobot-record with --robot.type=locobot_sim and --dataset.video=false."
         )
     cameras = other_camera(have, camera)
     if cameras is not None:

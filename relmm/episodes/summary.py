@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, DatasetFolder
+from relmm.episodes.outcomes import DERIVED, SOURCES, with_outcomes
 from relmm.episodes.parquet import read_table
 from relmm.episodes.survey import read_places
 from relmm.errors import DatasetError
@@ -107,15 +108,17 @@ def _read(folder: DatasetFolder, files: list[str]) -> dict[str, NDArray[Any]]:
     tables = []
     for name in files:
         try:
-            found = read_table(folder.root / name, list(COLUMNS)).replace_schema_metadata()
+            found = read_table(folder.root / name, list(COLUMNS))
+            missing = set(COLUMNS) - set(found.column_names)
+            if missing and missing <= set(DERIVED):
+                found = read_table(folder.root / name, sorted({*COLUMNS, *SOURCES} - missing))
         except (OSError, pa.ArrowException) as error:
             raise DatasetError(f"{folder.root / name} cannot be read ({error}); repair the dataset first.") from error
-        missing = set(COLUMNS) - set(found.column_names)
-        if missing:
-            raise DatasetError(f"{folder.root} is no relmm dataset, it has no column {min(missing)}.")
-        tables.append(found)
+        if not missing <= set(DERIVED):
+            raise DatasetError(f"{folder.root} is no relmm dataset, it has no column {min(missing - set(DERIVED))}.")
+        tables.append(found.replace_schema_metadata())
     try:
-        table = pa.concat_tables(tables)
+        table, _ = with_outcomes(pa.concat_tables(tables))
         flat = {key: table[key].combine_chunks() for key in COLUMNS}
         flat["action"] = flat["action"].flatten()
         numbers = {key: values.to_numpy(zero_copy_only=False).astype(np.float64) for key, values in flat.items()}

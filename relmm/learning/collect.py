@@ -1,6 +1,8 @@
-"""Episodes without resets: a policy acts until something is picked up, carries it elsewhere, and goes on from there."""
+"""The two ways to record: practice without resets, where what is picked up is carried elsewhere, and cleaning rooms."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -38,3 +40,25 @@ class Collector:
                 return True
             self._actor.watch(self._life.observation)
         return False
+
+
+class Cleaner:
+    """Lets a policy clean one room after another: no pseudo-resets, and what is picked up goes where the policy says.
+
+    Args:
+        life: of the robot, with the number of objects that are to be collected.
+        actor: the policy; it remembers nothing of the last room.
+        set_up: makes the next room ready.
+    """
+
+    def __init__(self, life: Life, actor: Actor, set_up: Callable[[], None]) -> None:
+        self._life, self._actor, self._set_up = life, actor, set_up
+
+    def episode(self) -> EpisodeResult:
+        """Clean one room; what a recorder raises comes through."""
+        self._set_up()
+        self._life.begin_anew()
+        self._actor.reset()
+        while not self._life.step(self._actor.act(self._life.observation), Phase.LEARNING, self._actor.belief):
+            pass
+        return self._life.last_episode

@@ -1,7 +1,8 @@
 """A robot's life, frame by frame: act, look, judge, and hand the frame to whoever keeps it.
 
 An episode begins with the pseudo-reset after the last success, if there was one, and ends with a success, at a step
-limit, or with a checkpoint. Its last frame is the only one that is done or truncated.
+limit, or with a checkpoint; where a room is to be cleaned, it ends when that is done, instead of with a success. Its
+last frame is the only one that is done or truncated.
 """
 
 from __future__ import annotations
@@ -14,7 +15,17 @@ from typing import Any, Protocol
 import numpy as np
 from lerobot.robots.robot import Robot
 
-from relmm.features import BELIEF, DRIVE_PULSE_S, FREE_GRASPS, MOTION_NAMES, ODOMETRY, FloatArray, Phase, Skill
+from relmm.features import (
+    BASKET_XY,
+    BELIEF,
+    DRIVE_PULSE_S,
+    FREE_GRASPS,
+    MOTION_NAMES,
+    ODOMETRY,
+    FloatArray,
+    Phase,
+    Skill,
+)
 from relmm.geometry import moved
 from relmm.learning.actor import TASK
 
@@ -41,13 +52,17 @@ class EpisodeResult:
     Attributes:
         frames: recorded, pseudo-reset included.
         grasps: attempts.
-        steps: that count towards the limit: navigation steps, and attempts beyond two in a row.
-        success: whether it ended with something in the gripper.
+        steps: that count towards the limit: navigation steps, and attempts beyond two after one.
+        picked_up: attempts that picked something up.
+        collected: objects put into the basket.
+        success: whether it was done when it ended.
     """
 
     frames: int = 0
     grasps: int = 0
     steps: int = 0
+    picked_up: int = 0
+    collected: int = 0
     success: bool = False
 
 
@@ -60,6 +75,8 @@ class Life:
         clock: seconds on the robot's own clock.
         max_steps: after which an episode is cut off.
         should_stop: asked after every frame; the episode is then cut off and saved.
+        to_collect: how many objects the robot has to put into its basket, by its own count, for an episode to be done;
+            None for episodes that are done with the first object picked up.
 
     Attributes:
         observation: the robot's last.
@@ -75,10 +92,11 @@ class Life:
         clock: Callable[[], float],
         max_steps: int,
         should_stop: Callable[[], bool],
+        to_collect: float | None = None,
     ) -> None:
         self._robot, self._recorders, self._clock = robot, recorders, clock
-        self._max_steps, self.should_stop = max_steps, should_stop
-        self._grasps_in_a_row = 0
+        self._max_steps, self.should_stop, self._to_collect = max_steps, should_stop, to_collect
+        self._grasps_since_drive = 0
         self.observation: dict[str, Any] = robot.get_observation()
         self.pose: FloatArray = np.zeros(3)
         self.episode = EpisodeResult()
@@ -92,6 +110,11 @@ class Life:
     def look_again(self) -> None:
         """Take a new observation, after someone else has changed the room."""
         self.observation = self._robot.get_observation()
+
+    def begin_anew(self) -> None:
+        """Begin a life in another room: nothing of the last one counts, its odometry included."""
+        self.look_again()
+        self.pose = np.zeros(3)
 
     def step(self, action: dict[str, float], phase: Phase, belief: Mapping[str, float] | None = None) -> bool:
         """Act, look, record.
@@ -109,15 +132,15 @@ class Life:
         done_action = self._robot.send_action(action)
         self.observation = self._robot.get_observation()
         self.pose = moved(self.pose, _motion(self.observation))
-        grasped = done_action["skill.pos"] == Skill.GRASP
-        self._count(grasped, phase)
-        success = self.succeeded = grasped and self.holding
-        truncated = not success and (self.episode.steps >= self._max_steps or self.should_stop())
+        self._count(done_action, phase)
+        success = self.succeeded
+        done = success if self._to_collect is None else self.episode.collected >= self._to_collect
+        truncated = not done and (self.episode.steps >= self._max_steps or self.should_stop())
         outcome = {
             "next.reward": float(success),
-            "next.done": success,
+            "next.done": done,
             "next.truncated": truncated,
-            "next.success": success,
+            "next.success": done,
             "complementary_info.phase": int(phase),
             **{f"complementary_info.{name}": (belief or {}).get(name, -1.0) for name in BELIEF},
             **{f"complementary_info.{name}": value for name, value in zip(ODOMETRY, odometry, strict=True)},
@@ -125,11 +148,11 @@ class Life:
         }
         for recorder in self._recorders:
             recorder.add_frame(before, done_action, outcome, TASK)
-        if success or truncated:
+        if done or truncated:
             for recorder in self._recorders:
                 recorder.save_episode()
-            self._begin_episode(success)
-        return success or truncated
+            self._begin_episode(done)
+        return done or truncated
 
     def cut_episode(self) -> None:
         """End the episode here, if it has any frames: what is recorded and learned then ends with the same one."""
@@ -138,17 +161,23 @@ class Life:
                 recorder.cut_episode()
             self._begin_episode(success=False)
 
-    def _count(self, grasped: bool, phase: Phase) -> None:
-        self._grasps_in_a_row = self._grasps_in_a_row + 1 if grasped else 0
-        counts = phase == Phase.CURRICULUM or (phase == Phase.LEARNING and not 0 < self._grasps_in_a_row <= FREE_GRASPS)
+    def _count(self, action: dict[str, float], phase: Phase) -> None:
+        skill = Skill(int(action["skill.pos"]))
+        grasped, placed = skill == Skill.GRASP, skill == Skill.PLACE
+        self._grasps_since_drive = 0 if skill == Skill.NAVIGATE else self._grasps_since_drive + grasped
+        free = placed or (grasped and self._grasps_since_drive <= FREE_GRASPS)
+        self.succeeded = grasped and self.holding
+        into_basket = placed and not self.holding and (action["skill_x.pos"], action["skill_y.pos"]) == BASKET_XY
         self.episode.frames += 1
         self.episode.grasps += grasped
-        self.episode.steps += counts
+        self.episode.steps += phase == Phase.CURRICULUM or (phase == Phase.LEARNING and not free)
+        self.episode.picked_up += self.succeeded
+        self.episode.collected += into_basket
 
     def _begin_episode(self, success: bool) -> None:
         self.episode.success = success
         self.last_episode, self.episode = self.episode, EpisodeResult()
-        self._grasps_in_a_row = 0
+        self._grasps_since_drive = 0
 
 
 def _motion(observation: dict[str, Any]) -> FloatArray:

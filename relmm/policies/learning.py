@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from relmm.errors import MANY, check_range
+from relmm.errors import MANY, ConfigError, check_range
 from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES, Phase, Skill
 from relmm.geometry import camera_geometry
 from relmm.policies.controller import ControllerConfig, ControllerPolicy, Row
@@ -164,6 +164,14 @@ class Learner(ABC):
                 case Skill.NAVIGATE if phase == Phase.LEARNING:
                     self.update_navigation()
         self.save_episode()
+
+
+def no_rewards() -> ConfigError:
+    """What to say of batches without `next.reward`: single frames do not tell whether the grasp worked."""
+    return ConfigError(
+        "The dataset has no column next.reward, and lerobot-train shows a policy no frame together with the next one, "
+        "which would tell whether a grasp worked: learn from this dataset by relmm-train --dataset.init=FOLDER_OR_REPO."
+    )
 
 
 class LearningPolicy(ControllerPolicy):

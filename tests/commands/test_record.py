@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from relmm.episodes import saved_episodes, summarize
-from relmm.features import ACTION_NAMES, Phase
+from relmm.features import ACTION_NAMES, BASKET_XY, Phase
 
 SIM = ("--robot.type=locobot_sim", "--robot.room=no_obstacles", "--dataset.repo_id=me/room")
 QUICK = ("--policy.type=relmm_random", "--max_steps=6", "--pseudo_reset_steps=2")
@@ -84,6 +84,23 @@ def test_record_carries_what_it_picked_up_elsewhere(run, tmp_path):
     skills = data["action"][second][pseudo_reset][:, ACTION_NAMES.index("skill.pos")]
     assert skills.tolist() == [0] * 9 + [2] + [0] * 7
     assert not data["next.reward"][second][pseudo_reset].any()
+
+
+@pytest.mark.timeout(300)  # several commands, one after the other
+def test_record_of_cleaning_has_a_room_an_episode_and_goes_on_with_other_rooms(run, tmp_path):
+    root = tmp_path / "room"
+    arguments = (*SIM, f"--dataset.root={root}", "--policy.type=relmm_scripted", "--mode=clean", "--max_steps=12")
+    for more in ("--dataset.num_episodes=2", "--dataset.num_episodes=1 --resume=true"):
+        result = run("relmm-record", *arguments, *more.split())
+        assert result.returncode == 0, result.stderr
+    data = columns(root, "action", "episode_index", "next.reward", "complementary_info.phase", "observation.state")
+    assert set(data["complementary_info.phase"].tolist()) == {Phase.LEARNING}
+    placed = data["action"][:, ACTION_NAMES.index("skill.pos")] == 2
+    assert placed.sum() > 0
+    np.testing.assert_allclose(data["action"][placed][:, 3:], [BASKET_XY] * placed.sum(), atol=1e-6)
+    starts = np.flatnonzero(np.diff(data["episode_index"], prepend=-1))
+    assert len(np.unique(data["observation.state"][starts], axis=0)) == 3
+    assert [run["mode"] for run in json.loads((root / "meta/relmm.json").read_text())["runs"]] == ["clean"] * 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -159,6 +176,7 @@ def test_record_by_a_policy_of_another_camera_is_refused(capsys, monkeypatch, tm
         ("--dataset.num_episodes=0", "must be at least 1"),
         ("--max_steps=-1", "must be at least 1"),
         ("--pseudo_reset_steps=-1", "must be at least 0"),
+        ("--mode=tidy", "mode is 'tidy', but must be one of practice, clean"),
         ("--seed=-1", "must be at least 0"),
         ("--seed=abc", "abc"),
         ("--policy.num_grasp=0", "must be at least 1"),

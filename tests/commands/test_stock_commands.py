@@ -8,7 +8,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from relmm.features import ACTION_NAMES, STATE_NAMES
+from relmm.episodes import read_episodes, summarize
+from relmm.features import ACTION_NAMES, STATE_NAMES, Skill
 
 ROBOT = ("--robot.type=locobot_sim", "--robot.room=diverse")
 
@@ -33,17 +34,19 @@ def recorded(tmp_path_factory) -> Path:
     return root
 
 
-def test_lerobot_record_with_scripted_teleoperator(run, tmp_path):
+@pytest.mark.timeout(300)  # several commands, one after the other
+def test_relmm_train_learns_from_what_lerobot_record_has_recorded(run, tmp_path):
+    """At LeRobot's own frame rate, and without the columns that only relmm writes."""
     result = run(
         "lerobot-record",
-        *ROBOT,
+        "--robot.type=locobot_sim",
+        "--robot.room=no_obstacles",
         "--teleop.type=locobot_scripted",
         "--dataset.repo_id=me/room",
         "--dataset.root=room",
         "--dataset.single_task=Clean the room",
         "--dataset.num_episodes=1",
-        "--dataset.fps=2",
-        "--dataset.episode_time_s=4",
+        "--dataset.episode_time_s=12",
         "--dataset.reset_time_s=0",
         "--dataset.video=false",
         "--dataset.push_to_hub=false",
@@ -51,11 +54,29 @@ def test_lerobot_record_with_scripted_teleoperator(run, tmp_path):
     )
     assert result.returncode == 0, result.stderr
     table = pq.read_table(tmp_path / "room/data/chunk-000/file-000.parquet")
+    assert "next.reward" not in table.column_names
     actions, states = np.array(table["action"].to_pylist()), np.array(table["observation.state"].to_pylist())
     assert actions.shape[1] == len(ACTION_NAMES)
     assert states.shape[1] == len(STATE_NAMES)
-    assert len(actions) >= 5
-    assert np.abs(actions).sum() > 0
+    (episode,) = read_episodes(tmp_path / "room")
+    placed = (
+        actions[1:, ACTION_NAMES.index("skill.pos")] == Skill.PLACE
+    )  # what the controller does when it holds something
+    assert episode.rewards[: len(placed)].sum() == placed.sum() > 0
+    assert summarize(tmp_path / "room").successful_grasps == placed.sum()
+    result = run(
+        "relmm-train",
+        "--robot.type=locobot_sim",
+        "--robot.room=no_obstacles",
+        "--dataset.init=room",
+        "--policy.device=cpu",
+        "--curriculum.type=none",
+        "--steps=1",
+        "--env_eval_freq=0",
+        "--output_dir=learned",
+    )
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "learned/checkpoints/last/pretrained_model/model.safetensors").exists()
 
 
 def test_lerobot_replay(run, recorded):

@@ -11,7 +11,7 @@ from relmm.commands.policies import make_actor
 from relmm.features import FREE_GRASPS, Phase, Skill
 from relmm.geometry import moved
 from relmm.learning.actor import Actor
-from relmm.learning.collect import Collector
+from relmm.learning.collect import Cleaner, Collector
 from relmm.learning.life import Life
 from relmm.policies.random.configuration_random import RelmmRandomConfig
 from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
@@ -100,6 +100,43 @@ def test_success_ends_the_episode_and_is_carried_elsewhere(robot):
     assert set(phases[15:]) == {Phase.LEARNING}
     rewards = [outcome["next.reward"] for episode in recorder.episodes for _, _, outcome, _ in episode]
     assert sum(rewards) == 2
+
+
+# --- Cleaning ------------------------------------------------------------------------------------------------
+def cleaner(robot: LocobotSim, max_steps: int, to_collect: int) -> tuple[Cleaner, ListRecorder]:
+    recorder, seeds = ListRecorder(), iter(range(11, 20))
+    life = Life(robot, [recorder], robot.seconds, max_steps, lambda: False, to_collect)
+    return Cleaner(life, make_actor(RelmmScriptedConfig(device="cpu")), lambda: robot.reset(next(seeds))), recorder
+
+
+def test_cleaning_puts_what_is_picked_up_into_the_basket_and_has_no_pseudo_reset(robot):
+    loop, recorder = cleaner(robot, max_steps=250, to_collect=2)
+    result = loop.episode()
+    assert (result.collected, result.success) == (2, True)
+    assert len(robot.body.truth.in_basket()) == 2
+    (episode,) = recorder.episodes
+    outcomes = [outcome for _, _, outcome, _ in episode]
+    assert {outcome["complementary_info.phase"] for outcome in outcomes} == {Phase.LEARNING}
+    placed = [number for number, frame in enumerate(episode) if frame[1]["skill.pos"] == Skill.PLACE]
+    assert [outcomes[number - 1]["next.reward"] for number in placed] == [1.0, 1.0], "what was just picked up"
+    assert [outcome["next.done"] for outcome in outcomes] == [False] * (len(episode) - 1) + [True]
+    assert outcomes[-1]["next.success"]
+
+
+def test_cleaning_ends_at_the_step_limit_and_goes_on_in_another_room(robot):
+    loop, recorder = cleaner(robot, max_steps=6, to_collect=20)
+    results = [loop.episode() for _ in range(2)]
+    assert [result.steps for result in results] == [6, 6]
+    assert not any(result.success for result in results)
+    for episode in recorder.episodes:
+        assert [outcome["next.truncated"] for _, _, outcome, _ in episode] == [False] * (len(episode) - 1) + [True]
+        drives = [outcome for _, action, outcome, _ in episode if action["skill.pos"] == Skill.NAVIGATE]
+        assert len(drives) == 6, "neither two attempts after a drive nor a placement cost a step"
+        first = episode[0][2]
+        assert (first["complementary_info.odom_x"], first["complementary_info.odom_heading"]) == (0.0, 0.0)
+        assert first["complementary_info.robot_time"] < 5.0
+    pictures = [episode[0][0]["front"] for episode in recorder.episodes]
+    assert np.any(pictures[0] != pictures[1])
 
 
 @pytest.mark.parametrize("stop_after", [1, 5])

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.errors import ConfigError
 from relmm.features import (
     ACTION_NAMES,
     DRIVE_PULSE_S,
@@ -24,7 +23,7 @@ from relmm.features import (
     cell_to_xy,
 )
 from relmm.policies.controller import Row, grasp_cell
-from relmm.policies.learning import LearningPolicy
+from relmm.policies.learning import LearningPolicy, no_rewards
 from relmm.policies.pseudo_reset import PLACE_XY
 from relmm.policies.relmm.carrying import choose_place, is_there
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
@@ -174,7 +173,7 @@ class ReLMMPolicy(LearningPolicy):
             ConfigError: the dataset has no rewards.
         """
         if not isinstance(batch.get("next.reward"), Tensor):  # LeRobot puts in the number 0 where there is no column
-            raise ConfigError("The dataset has no column next.reward: train relmm from one of relmm-record or -train.")
+            raise no_rewards()
         attempts = self._attempts if self.training else Attempts(len(batch["action"]))
         rows = batch["action"][:, _SKILL].round() == Skill.GRASP
         areas, actions = self.grasping.area(batch[IMAGE_KEY][rows]), batch["action"][rows].cpu().numpy()

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, Skill, xy_to_cell
+from relmm.policies.learning import no_rewards
 from relmm.policies.relmm_paper.navigation import from_navigation_steps
 
 _SKILL, _X, _Y = (ACTION_NAMES.index(name) for name in ("skill.pos", "skill_x.pos", "skill_y.pos"))
@@ -59,9 +59,7 @@ def read_batch(batch: dict[str, Any]) -> tuple[list[Attempt], list[Step]]:
         ConfigError: the dataset has no rewards.
     """
     if not isinstance(batch.get("next.reward"), Tensor):  # LeRobot puts in the number 0 where there is no column
-        raise ConfigError(
-            "The dataset has no column next.reward: train relmm_paper from one of relmm-record or -train."
-        )
+        raise no_rewards()
     pictures = (batch[IMAGE_KEY].clamp(0, 1) * 255).round().to(torch.uint8)  # (batch, time, 3, 100, 100)
     actions, rewards = batch["action"].cpu(), batch["next.reward"].flatten().tolist()
     padded = batch[f"{IMAGE_KEY}_is_pad"].tolist()

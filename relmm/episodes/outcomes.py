@@ -1,0 +1,75 @@
+"""How each frame ended, also where LeRobot's own recorder has not written it down.
+
+Whether a grasp worked can be seen in the next observation of its episode, where the robot says whether it holds
+something. Nothing follows on an episode's last frame: what a grasp there came to is not known.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from relmm.features import ACTION_NAMES, FPS, STATE_KEY, STATE_NAMES, Phase, Skill
+
+_SKILL, _HOLDING = ACTION_NAMES.index("skill.pos"), STATE_NAMES.index("holding.pos")
+# The columns that `with_outcomes` makes where they are missing, and those that it makes them from.
+DERIVED = (
+    "next.reward",
+    "next.done",
+    "next.truncated",
+    "next.success",
+    "complementary_info.phase",
+    "complementary_info.grasp_probability",
+    "complementary_info.robot_time",
+)
+SOURCES = ("action", STATE_KEY, "episode_index")
+
+
+def with_outcomes(frames: pa.Table) -> tuple[pa.Table, NDArray[np.bool_]]:
+    """Add the columns of `DERIVED` that are missing.
+
+    Where nobody wrote down who acted, the policy did; where nobody looked at the robot's clock, a frame lasts as long
+    as a navigation step, which is the least it can.
+
+    Args:
+        frames: rows of whole episodes, in order, with the columns of `SOURCES`.
+
+    Returns:
+        The rows, and for each whether it is known how it ended, (n,).
+
+    Raises:
+        ValueError: a column of `SOURCES` does not have the shape it must have.
+    """
+    missing = [name for name in DERIVED if name not in frames.column_names]
+    known = np.ones(len(frames), np.bool_)
+    if not missing or not len(frames):
+        return frames, known
+    episode = frames["episode_index"].to_numpy()
+    last = np.append(episode[1:] != episode[:-1], True)
+    grasp = _column(frames, "action", len(ACTION_NAMES), _SKILL).round() == Skill.GRASP
+    held_after = np.append(_column(frames, STATE_KEY, len(STATE_NAMES), _HOLDING)[1:] > 0.5, False)
+    success = grasp & held_after & ~last
+    if "next.reward" in missing:
+        known = ~(grasp & last)
+    first = np.flatnonzero(np.roll(last, 1))
+    number = np.arange(len(frames)) - np.repeat(first, np.diff(np.append(first, len(frames))))
+    values = {
+        "next.reward": success.astype(np.float32),
+        # A success is seen in the frame after it, so that such an episode always goes on after its last one.
+        "next.done": np.zeros(len(frames), np.bool_),
+        "next.truncated": last,
+        "next.success": np.zeros(len(frames), np.bool_),
+        "complementary_info.phase": np.full(len(frames), Phase.LEARNING, np.int64),
+        "complementary_info.grasp_probability": np.full(len(frames), -1, np.float32),
+        "complementary_info.robot_time": (number / FPS).astype(np.float32),
+    }
+    for name in missing:
+        frames = frames.append_column(name, pa.array(values[name]))
+    return frames, known
+
+
+def _column(frames: pa.Table, key: str, width: int, which: int) -> NDArray[np.float32]:
+    """One of the numbers that a column holds a list of."""
+    numbers = frames[key].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    return numbers.reshape(len(frames), width)[:, which]
