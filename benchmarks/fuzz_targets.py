@@ -264,7 +264,7 @@ _SLOW = {"relmm-train", "relmm-eval", "relmm-record", "metrics.jsonl", "stats.js
 _SLOW |= {"train_config.json from the Hub", "train_config.json, --config_path", "relmm.json, uploaded"}
 _READS_LITTLE = {"dataset.json", "training_step.json", "info.json", "relmm-upload", "train_config.json, uploaded"}
 _READS_LITTLE |= {"episodes parquet", "data parquet"}
-SLOWNESS = {kind: 8 if kind in _SLOW else 1 if kind in _READS_LITTLE else 3 for kind in (*FILES, *COMMANDS)}
+SLOWNESS = {kind: 20 if kind in _SLOW else 1 if kind in _READS_LITTLE else 3 for kind in (*FILES, *COMMANDS)}
 
 
 def parse(config_class: type, arguments: list[str]) -> Any:

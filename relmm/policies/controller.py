@@ -39,6 +39,7 @@ from relmm.features import (
 from relmm.geometry import other_camera
 from relmm.policies.pseudo_reset import random_pseudo_reset
 
+_NORMALIZED = ("VISUAL", "STATE", "ACTION")
 _HOLDING = STATE_NAMES.index("holding.pos")
 
 
@@ -57,7 +58,7 @@ class ControllerConfig(PreTrainedConfig):
     seed: int | None = None
     num_grasp: int = 2
     normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+        default_factory=lambda: dict.fromkeys(_NORMALIZED, NormalizationMode.IDENTITY)
     )
 
     def __post_init__(self) -> None:
@@ -72,7 +73,7 @@ class ControllerConfig(PreTrainedConfig):
         }
         check_range("policy.num_grasp", self.num_grasp, 1, MANY)
         check_range("policy.seed", self.seed or 0, 0, MAX_SEED)
-        if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:
+        if not self.normalization_mapping.items() <= dict.fromkeys(_NORMALIZED, NormalizationMode.IDENTITY).items():
             raise ConfigError(
                 "policy.normalization_mapping must be IDENTITY throughout, for relmm's policies take raw pictures; "
                 "leave it out."

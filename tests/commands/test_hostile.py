@@ -136,6 +136,10 @@ DAMAGES: dict[str, tuple[Callable[[dict[str, bytes]], object], str]] = {
         changed_config(normalization_mapping={"STATE": "MEAN_STD"}),
         "normalization_mapping must be IDENT",
     ),
+    "normalization of what is not": (
+        changed_config(normalization_mapping={"x": "IDENTITY"}),
+        "normalization_mapping must",
+    ),
     "huge batches": (changed_config(batch_size=10**23), "policy.batch_size is 1000"),
     "huge seed": (changed_config(seed=10**23), "policy.seed is 1000"),
     "no device": (changed_config(device="../.."), "No policy can be loaded"),
