@@ -113,11 +113,12 @@ def _read(folder: DatasetFolder, files: list[str]) -> dict[str, NDArray[Any]]:
                 missing = set(COLUMNS) - names - set(DERIVED)
                 if missing:
                     raise DatasetError(f"{folder.root} is no relmm dataset, it has no column {min(missing)}.")
-                wanted = COLUMNS if names.issuperset(COLUMNS) else {*COLUMNS, *SOURCES} & names
-                tables.append(file.read(columns=list(wanted)).replace_schema_metadata())
+                sources = () if names.issuperset(COLUMNS) else SOURCES
+                wanted = [name for name in dict.fromkeys((*COLUMNS, *sources)) if name in names]
+                tables.append(file.read(columns=wanted).replace_schema_metadata())
         except (OSError, pa.ArrowException) as error:
             raise DatasetError(f"{folder.root / name} cannot be read ({error}); repair the dataset first.") from error
-    table, _ = with_outcomes(pa.concat_tables(tables))
+    table, _ = with_outcomes(pa.concat_tables(tables), COLUMNS)
     flat = {key: table[key].combine_chunks() for key in COLUMNS}
     flat["action"] = flat["action"].flatten()
     return {key: values.to_numpy(zero_copy_only=False) for key, values in flat.items()}

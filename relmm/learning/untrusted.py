@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.processor import ProcessorStepRegistry
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -41,20 +42,47 @@ def check_policy_folder(folder: Path) -> None:
     Raises:
         ConfigError: with what is wrong.
     """
-    config = read_json(folder / CONFIG)
-    known = PreTrainedConfig.get_known_choices()
-    own = sorted(name for name, choice in known.items() if issubclass(choice, ControllerConfig))
-    if not isinstance(config, dict) or config.get("type") not in own:
-        kind = config.get("type") if isinstance(config, dict) else config
-        raise ConfigError(
-            f"{folder / CONFIG} is of a policy {kind!r}, and relmm's commands load {', '.join(own)}; "
-            "use lerobot-eval for policies of others."
-        )
+    config = _check_type(folder, ControllerConfig)
     refuse_first_version(config, folder / CONFIG)
     for name in PROCESSORS:
-        _check_processor(folder / name, read_json(folder / name))
+        _check_processor(folder / name, read_json(folder / name), _STEPS)
     if not (folder / WEIGHTS).is_file():
         raise ConfigError(f"{folder} has no {WEIGHTS}: give the folder of a checkpoint's pretrained_model.")
+
+
+def check_any_policy_folder(folder: Path, trusted: bool) -> None:
+    """As `check_policy_folder`, but policies of others than relmm may pass, too.
+
+    Args:
+        folder: what `--policy.path` leads to.
+        trusted: it is the user's own: what the processors of a policy of others import is left to LeRobot. Else they
+            may have only the steps that LeRobot itself registers by name.
+
+    Raises:
+        ConfigError: with what is wrong.
+    """
+    import lerobot.policies.factory  # noqa: F401  (registers LeRobot's own policies)
+
+    config = _check_type(folder, PreTrainedConfig)
+    if issubclass(PreTrainedConfig.get_choice_class(config["type"]), ControllerConfig):
+        check_policy_folder(folder)
+    elif not trusted:
+        for name in PROCESSORS:
+            _check_processor(folder / name, read_json(folder / name), set(ProcessorStepRegistry.list()))
+
+
+def _check_type(folder: Path, kind: type[PreTrainedConfig]) -> dict[str, Any]:
+    """The config of a policy whose class is of this kind."""
+    config = read_json(folder / CONFIG)
+    choices = PreTrainedConfig.get_known_choices()
+    known = sorted(name for name, choice in choices.items() if issubclass(choice, kind))
+    if not isinstance(config, dict) or config.get("type") not in known:
+        name = config.get("type") if isinstance(config, dict) else config
+        raise ConfigError(
+            f"{folder / CONFIG} is of a policy {name!r}, and this loads {', '.join(known)}; use another checkpoint, or "
+            "install the package that the policy is from."
+        )
+    return config
 
 
 def refuse_first_version(config: Mapping[str, Any], path: Path) -> None:
@@ -92,15 +120,15 @@ def read_json(path: Path) -> Any:
         raise ConfigError(f"{path} is no JSON that can be read ({error}); use another checkpoint.") from error
 
 
-def _check_processor(path: Path, pipeline: Any) -> None:
+def _check_processor(path: Path, pipeline: Any, allowed: set[str]) -> None:
     steps = pipeline.get("steps") if isinstance(pipeline, dict) else None
     if not isinstance(steps, list):
         raise ConfigError(f"{path} describes no processor, it has no list of steps; use another checkpoint.")
     for step in steps:
-        if not isinstance(step, dict) or step.get("registry_name") not in _STEPS or "class" in step:
+        if not isinstance(step, dict) or step.get("registry_name") not in allowed or "class" in step:
             name = (step.get("class") or step.get("registry_name")) if isinstance(step, dict) else step
             raise ConfigError(
-                f"{path} has a step {name!r}, and policies of relmm have {', '.join(sorted(_STEPS))}; do not use it."
+                f"{path} has a step {name!r}, which is none of the steps that such policies have; do not use it."
             )
         file = step.get("state_file")
         if file is not None and (not isinstance(file, str) or Path(file).name != file or Path(file).is_absolute()):
