@@ -123,7 +123,7 @@ def outcome_features() -> dict[str, dict[str, Any]]:
     scalar = {"shape": (1,), "names": None}
     return {
         "next.reward": {"dtype": "float32", **scalar},  # 1.0 when this frame's grasp picked something up
-        "next.done": {"dtype": "bool", **scalar},  # the episode ended with a success
+        "next.done": {"dtype": "bool", **scalar},  # the episode ended with what it was for
         "next.truncated": {"dtype": "bool", **scalar},  # the episode ended at its step limit
         "next.success": {"dtype": "bool", **scalar},
         "complementary_info.phase": {"dtype": "int64", **scalar},  # a `Phase`
@@ -146,14 +146,15 @@ DATASET_COLUMNS = {
     IMAGE_KEY: "the robot's camera before the skill, RGB, PNG, lossless",
     DEPTH_KEY: "millimetres along the optical axis",
     "next.reward": "1.0 where this frame's grasp picked something up, as the robot's own sensors judge it",
-    "next.done": "the episode ended with that success",
+    "next.done": "the episode ended with that success, or with all objects in the basket (`--mode=clean`)",
     "next.truncated": "the episode ended at its step limit, or because the recording was stopped",
     "next.success": "as `next.done`",
     "complementary_info.phase": "who acted, see above",
     "complementary_info.grasp_probability": "P[grasp] before the action where the policy estimates it, else -1",
     "complementary_info.grasp_mean": "the ensemble's mean success at the attempted cell before the attempt, else -1",
     "complementary_info.grasp_std": "its standard deviation over the members, else -1",
-    "complementary_info.odom_x": "m, where the robot was when the frame began, by its wheels since the run began",
+    "complementary_info.odom_x": "m, where the robot was when the frame began, by its wheels since the run began "
+    "(`--mode=clean`: the episode)",
     "complementary_info.odom_y": "m, likewise",
     "complementary_info.odom_heading": "degrees, likewise, not wrapped, positive = left",
     "complementary_info.robot_time": "s on the robot's clock when the frame began",

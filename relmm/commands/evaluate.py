@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
@@ -59,7 +60,7 @@ class EvalConfig:
 
     Args:
         env: `--env.room=...`.
-        policy: who acts.
+        policy: who acts, any policy of LeRobot with relmm's pictures, states and actions.
         eval: how many episodes and videos.
         output_dir: a folder that does not exist yet; None for outputs/eval/DATE/TIME_ROOM_POLICY, as lerobot-eval.
         seed: of the first episode; 1000 as in lerobot-eval.
@@ -125,6 +126,7 @@ def evaluate(config: EvalConfig) -> None:
     assert config.policy is not None
     assert config.output_dir is not None
     take_seed(config.policy, 0)
+    torch.manual_seed(config.seed)  # policies of others may draw from it
     actor = make_actor(config.policy)
     env = RelmmRoomEnv(**{**config.env.gym_kwargs, "render_mode": None})
     scores: list[EpisodeScore] = []

@@ -15,6 +15,7 @@ from relmm.features import dataset_features
 from relmm.learning.actor import Actor
 from relmm.learning.hub import fetch_policy
 from relmm.learning.untrusted import check_features, check_policy_folder, check_weights
+from relmm.policies.controller import ControllerConfig
 
 
 def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
@@ -119,7 +120,12 @@ def take_seed(config: Any, seed: int) -> None:
 
 
 def make_actor(config: PreTrainedConfig) -> Actor:
-    """The policy with its processors, ready to act on a LoCoBot."""
+    """The policy with its processors, ready to act on a LoCoBot.
+
+    Raises:
+        ConfigError: a policy of others that has learned nothing, or cannot be loaded; or one of relmm's that does not
+            fit its config.
+    """
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
@@ -127,12 +133,27 @@ def make_actor(config: PreTrainedConfig) -> Actor:
     if not config.input_features:
         config.input_features = {key: value for key, value in features.items() if key != "action"}
     config.output_features = {"action": features["action"]}
-    path, policy_class = config.pretrained_path, get_policy_class(config.type)
+    path, own = config.pretrained_path, isinstance(config, ControllerConfig)
+    if path is None and not own:
+        raise ConfigError(f"A policy {config.type} has to learn first: say --policy.path=FOLDER_OR_REPO.")
     if path is None:
-        policy = policy_class(config=config)
-    else:
+        return Actor(get_policy_class(config.type)(config=config), *make_pre_post_processors(config))
+    if own:
         check_policy_folder(Path(path))
         check_weights(config, Path(path))
-        policy = policy_class.from_pretrained(path, config=config)
-    # The stored processors say nothing that the config does not; nothing of theirs has to be trusted.
-    return Actor(policy, *make_pre_post_processors(config))
+        policy = get_policy_class(config.type).from_pretrained(path, config=config)
+        # The stored processors say nothing that the config does not; nothing of theirs has to be trusted.
+        return Actor(policy, *make_pre_post_processors(config))
+    if hasattr(config, "pretrained_backbone_weights"):
+        config.pretrained_backbone_weights = None  # those of the checkpoint replace them; LeRobot would download them
+    # The processors were saved with the device of the machine that trained.
+    device = {"device_processor": {"device": config.device}}
+    try:
+        policy = get_policy_class(config.type).from_pretrained(path, config=config)
+        pre, post = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=device)
+    except (ImportError, LookupError, OSError, RuntimeError, ValueError) as error:
+        raise own_error(error) or ConfigError(
+            f"The policy {config.type} in {path} cannot be loaded ({' '.join(str(error).split())}): use another "
+            "checkpoint, or install what it needs."
+        ) from error
+    return Actor(policy, pre, post)

@@ -20,6 +20,10 @@ _PHASES = {
     Phase.PSEUDO_RESET: "a random walk carried the object elsewhere and put it down",
     Phase.EVALUATION: "the policy was evaluated",
 }
+_EPISODES = {  # by what a run says of itself; LeRobot's own recorder says nothing
+    "practice": "An episode goes from the pseudo-reset after one success to the next success, or to a step limit.",
+    "clean": "An episode is one room, until all its objects are in the basket, or to a step limit.",
+}
 CITATION = """```bibtex
 @inproceedings{sun2021relmm,
   title     = {Fully Autonomous Real-World Reinforcement Learning with Applications to Mobile Manipulation},
@@ -50,7 +54,7 @@ def dataset_card(folder: DatasetFolder, repo_id: str, license: str, contact_shee
     )
     sections = [
         f"---\n{data.to_yaml()}\n---",
-        _head(repo_id, info, contact_sheet),
+        _head(repo_id, info, {run.get("mode", "practice") for run in own.get("runs", [])}, contact_sheet),
         "## What is in it\n\n" + _counts(summary),
         "## Who acted\n\n" + _who(summary),
         "## Columns\n\n" + _columns(info["features"]),
@@ -61,14 +65,15 @@ def dataset_card(folder: DatasetFolder, repo_id: str, license: str, contact_shee
     return DatasetCard("\n\n".join(sections) + "\n", ignore_metadata_errors=False)
 
 
-def _head(repo_id: str, info: dict[str, Any], contact_sheet: bool) -> str:
+def _head(repo_id: str, info: dict[str, Any], modes: set[str], contact_sheet: bool) -> str:
     sheet = f"\n\n![Pictures of the dataset]({CONTACT_SHEET})\n*What the robot does next, episode:frame.*"
+    sheet = sheet if contact_sheet else ""
     return f"""# {repo_id}
 
 The life of a LoCoBot ({info.get("robot_type")}) that picks things up in a room, recorded with `relmm`, a
 [LeRobot]({_LEROBOT}) package of ReLMM, as a LeRobot {info.get("codebase_version")} dataset.
-An episode goes from the pseudo-reset after one success to the next success, or to a step limit. A frame is one blocking
-skill: what the robot saw before it, what it then did, and how that ended.{sheet if contact_sheet else ""}"""
+{" ".join(_EPISODES[mode] for mode in sorted(modes & _EPISODES.keys()))}
+A frame is one blocking skill: what the robot saw before it, what it then did, and how that ended.{sheet}"""
 
 
 def _counts(summary: DatasetSummary) -> str:

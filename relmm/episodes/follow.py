@@ -41,7 +41,7 @@ class Episode:
         states: (n, len(STATE_NAMES)) float32, units as in `relmm.features`.
         actions: (n, 5) float32, what was done, by `relmm.features.ACTION_NAMES`.
         rewards: (n,) float32, 1 where the frame's grasp picked something up; see `relmm.episodes.outcomes`.
-        dones: (n,) bool, ended with a success.
+        dones: (n,) bool, ended with what the episode was for.
         truncated: (n,) bool, ended at the step limit.
         phases: (n,) int64, a `relmm.features.Phase` each.
         grasp_probabilities: (n,) float32, P[grasp], -1 where it was not asked.
@@ -232,7 +232,7 @@ class _DataFiles:
         except (*_WRONG_TYPES, cv2.error) as error:
             raise DatasetError(f"a picture of episode {index} in {where} cannot be read: {error}.") from error
         try:
-            frames, known = with_outcomes(frames)
+            frames, known = with_outcomes(frames, TRAINING_COLUMNS)
             if not known[-1] and len(frames) > 1:  # it teaches nothing, and would count as a failure
                 images, frames = images[:-1], frames.slice(0, len(frames) - 1)
             return self._checked(index, images, frames)

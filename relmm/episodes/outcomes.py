@@ -6,6 +6,8 @@ something. Nothing follows on an episode's last frame: what a grasp there came t
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -26,14 +28,15 @@ DERIVED = (
 SOURCES = ("action", STATE_KEY, "episode_index")
 
 
-def with_outcomes(frames: pa.Table) -> tuple[pa.Table, NDArray[np.bool_]]:
-    """Add the columns of `DERIVED` that are missing.
+def with_outcomes(frames: pa.Table, wanted: Container[str]) -> tuple[pa.Table, NDArray[np.bool_]]:
+    """Add those columns of `DERIVED` that are wanted and missing.
 
     Where nobody wrote down who acted, the policy did; where nobody looked at the robot's clock, a frame lasts as long
     as a navigation step, which is the least it can.
 
     Args:
-        frames: rows of whole episodes, in order, with the columns of `SOURCES`.
+        frames: rows of whole episodes, in order; with the columns of `SOURCES`, if any is missing.
+        wanted: names of columns.
 
     Returns:
         The rows, and for each whether it is known how it ended, (n,).
@@ -41,7 +44,7 @@ def with_outcomes(frames: pa.Table) -> tuple[pa.Table, NDArray[np.bool_]]:
     Raises:
         ValueError: a column of `SOURCES` does not have the shape it must have.
     """
-    missing = [name for name in DERIVED if name not in frames.column_names]
+    missing = [name for name in DERIVED if name in wanted and name not in frames.column_names]
     known = np.ones(len(frames), np.bool_)
     if not missing or not len(frames):
         return frames, known

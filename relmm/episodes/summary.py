@@ -118,7 +118,7 @@ def _read(folder: DatasetFolder, files: list[str]) -> dict[str, NDArray[Any]]:
             raise DatasetError(f"{folder.root} is no relmm dataset, it has no column {min(missing - set(DERIVED))}.")
         tables.append(found.replace_schema_metadata())
     try:
-        table, _ = with_outcomes(pa.concat_tables(tables))
+        table, _ = with_outcomes(pa.concat_tables(tables), COLUMNS)
         flat = {key: table[key].combine_chunks() for key in COLUMNS}
         flat["action"] = flat["action"].flatten()
         numbers = {key: values.to_numpy(zero_copy_only=False).astype(np.float64) for key, values in flat.items()}

@@ -25,7 +25,7 @@ from relmm.errors import MANY, ConfigError, HubError
 from relmm.learning.checkpoint import STEP, pretrained_model, training_state
 from relmm.learning.settings import SETTINGS, portable_settings
 from relmm.learning.sums import SUMS
-from relmm.learning.untrusted import CONFIG, WEIGHTS, check_policy_folder, read_json
+from relmm.learning.untrusted import CONFIG, WEIGHTS, check_any_policy_folder, check_policy_folder, read_json
 
 METRICS, CURVE, CARD = "metrics.jsonl", "learning_curve.png", "README.md"
 _DATASET = "training_state/dataset.json"
@@ -157,15 +157,16 @@ def split_revision(path_or_repo: str) -> tuple[str, str]:
 
 
 def fetch_policy(path_or_repo: str) -> Path:
-    """The folder of a policy that somebody names: a local one, or one downloaded from the Hub; checked.
+    """The folder of a policy that somebody names, of relmm or not: a local one, or one from the Hub; checked.
 
     Raises:
-        ConfigError: there is none, or it is not one of relmm's.
+        ConfigError: there is none, or it could run code of its choice.
     """
     folder = Path(path_or_repo).expanduser()
-    if not folder.is_dir():
+    trusted = folder.is_dir()
+    if not trusted:
         folder = _download(*split_revision(path_or_repo), POLICY_FILES)
-    check_policy_folder(folder)
+    check_any_policy_folder(folder, trusted)
     return folder
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.processor import ProcessorStepRegistry
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -48,21 +49,48 @@ def check_policy_folder(folder: Path) -> None:
     Raises:
         ConfigError: with what is wrong.
     """
-    config = read_json(folder / CONFIG)
-    known = PreTrainedConfig.get_known_choices()
-    own = sorted(name for name, choice in known.items() if issubclass(choice, ControllerConfig))
-    if not isinstance(config, dict) or config.get("type") not in own:
-        kind = reprlib.repr(config.get("type") if isinstance(config, dict) else config)
-        raise ConfigError(
-            f"{folder / CONFIG} is of a policy {kind}, and relmm's commands load {', '.join(own)}; "
-            "use lerobot-eval for policies of others."
-        )
+    config = _check_type(folder, ControllerConfig)
     refuse_first_version(config, folder / CONFIG)
     for name in PROCESSORS:
-        _check_processor(folder / name, read_json(folder / name))
+        _check_processor(folder / name, read_json(folder / name), _STEPS)
     if not (folder / WEIGHTS).is_file():
         raise ConfigError(f"{folder} has no {WEIGHTS}: give the folder of a checkpoint's pretrained_model.")
     check_sums(folder)
+
+
+def check_any_policy_folder(folder: Path, trusted: bool) -> None:
+    """As `check_policy_folder`, but policies of others than relmm may pass, too.
+
+    Args:
+        folder: what `--policy.path` leads to.
+        trusted: it is the user's own: what the processors of a policy of others import is left to LeRobot. Else they
+            may have only the steps that LeRobot itself registers by name.
+
+    Raises:
+        ConfigError: with what is wrong.
+    """
+    import lerobot.policies.factory  # noqa: F401  (registers LeRobot's own policies)
+
+    config = _check_type(folder, PreTrainedConfig)
+    if issubclass(PreTrainedConfig.get_choice_class(config["type"]), ControllerConfig):
+        check_policy_folder(folder)
+    elif not trusted:
+        for name in PROCESSORS:
+            _check_processor(folder / name, read_json(folder / name), dict.fromkeys(ProcessorStepRegistry.list()))
+
+
+def _check_type(folder: Path, kind: type[PreTrainedConfig]) -> dict[str, Any]:
+    """The config of a policy whose class is of this kind."""
+    config = read_json(folder / CONFIG)
+    choices = PreTrainedConfig.get_known_choices()
+    known = sorted(name for name, choice in choices.items() if issubclass(choice, kind))
+    if not isinstance(config, dict) or config.get("type") not in known:
+        name = config.get("type") if isinstance(config, dict) else config
+        raise ConfigError(
+            f"{folder / CONFIG} is of a policy {name!r}, and this loads {', '.join(known)}; use another checkpoint, or "
+            "install the package that the policy is from."
+        )
+    return config
 
 
 def refuse_first_version(config: Mapping[str, Any], path: Path) -> None:
@@ -100,25 +128,26 @@ def read_json(path: Path) -> Any:
         raise ConfigError(f"{path} is no JSON that can be read ({error}); use another checkpoint.") from error
 
 
-def _check_processor(path: Path, pipeline: Any) -> None:
+def _check_processor(path: Path, pipeline: Any, allowed: Mapping[str, dict[str, Any] | None]) -> None:
+    """Refuse steps other than these, and settings other than theirs; None for any."""
     steps = pipeline.get("steps") if isinstance(pipeline, dict) else None
     if not isinstance(steps, list):
         raise ConfigError(f"{path} describes no processor, it has no list of steps; use another checkpoint.")
     for step in steps:
         name = (step.get("class") or step.get("registry_name")) if isinstance(step, dict) else step
-        if not isinstance(step, dict) or not isinstance(name, str) or name not in _STEPS or "class" in step:
+        if not isinstance(step, dict) or not isinstance(name, str) or name not in allowed or "class" in step:
             raise ConfigError(
-                f"{path} has a step {reprlib.repr(name)}, and policies of relmm have {', '.join(sorted(_STEPS))}; do "
-                "not use it."
+                f"{path} has a step {reprlib.repr(name)}, which is none of the steps that such policies have; do not "
+                "use it."
             )
-        _check_step(path, name, step.get("config", {}))
+        if (expected := allowed[name]) is not None:
+            _check_step(path, name, step.get("config", {}), expected)
         if (file := step.get("state_file")) is not None:
             _check_state(path, file)
 
 
-def _check_step(path: Path, name: str, settings: Any) -> None:
+def _check_step(path: Path, name: str, settings: Any, allowed: dict[str, Any]) -> None:
     """Refuse what would rename pictures or change numbers; relmm's commands make the steps anew, LeRobot's do not."""
-    allowed = _STEPS[name]
     items = settings.items() if isinstance(settings, dict) else [("config", settings)]
     for key, value in items:
         if key not in allowed or allowed[key] not in (_ANY, value):

@@ -179,7 +179,7 @@ class LocobotRobot(Robot):
             with an empty one, or where something is in the arm's way, become a navigation step that stands still.
 
         Raises:
-            RobotError: an unknown skill, or a value that is not a finite number. Nothing has moved then.
+            RobotError: a value that is not a finite number. Nothing has moved then.
         """
         values = {name: float(action.get(name, 0.0)) for name in ACTION_NAMES}
         if not all(math.isfinite(value) for value in values.values()):
@@ -219,11 +219,7 @@ class LocobotRobot(Robot):
 
 
 def _skill(value: float) -> Skill:
-    try:
-        return Skill(round(value))
-    except ValueError:
-        allowed = ", ".join(f"{skill.value} ({skill.name.lower()})" for skill in Skill)
-        raise RobotError(f"Unknown skill {value:g} in skill.pos: allowed are {allowed}.") from None
+    return Skill(round(_clip(value, (min(Skill), max(Skill)))))
 
 
 def _refusal(skill: Skill) -> tuple[str, str]:

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,8 +11,12 @@ import sys
 import av
 import numpy as np
 import pytest
+import torch
 
 from relmm.commands import evaluate as command
+from relmm.errors import ConfigError
+from relmm.features import dataset_features
+from relmm.learning.untrusted import check_any_policy_folder
 
 SETTINGS = ("--env.type=relmm_room", "--env.room=diverse", "--env.navigation_steps=15", "--seed=7")
 
@@ -43,6 +48,95 @@ def test_evaluate_agrees_with_lerobot_eval(run, tmp_path):
     assert sum(collected) > 0
     assert own["overall"]["avg_sum_reward"] == pytest.approx(stock["overall"]["avg_sum_reward"])
     assert own["overall"]["pc_success"] == stock["overall"]["pc_success"]
+
+
+@pytest.fixture(scope="module")
+def act(tmp_path_factory):
+    """A small ACT that has learned nothing, as `lerobot-train` saves it."""
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    features = dataset_to_policy_features(dataset_features())
+    config = ACTConfig(
+        device="cpu",
+        input_features={key: feature for key, feature in features.items() if key != "action"},
+        output_features={"action": features["action"]},
+        pretrained_backbone_weights=None,
+        dim_model=16,
+        dim_feedforward=16,
+        n_heads=2,
+        chunk_size=4,
+        n_action_steps=4,
+    )
+    ones = {key: {name: torch.ones(1) for name in ("mean", "std", "min", "max")} for key in features}
+    folder = tmp_path_factory.mktemp("act")
+    for part in (ACTPolicy(config), *make_pre_post_processors(config, dataset_stats=ones)):
+        part.save_pretrained(folder)
+    # As it is by default: LeRobot would download these weights to replace them by the checkpoint's.
+    saved = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(
+        json.dumps(saved | {"pretrained_backbone_weights": "ResNet18_Weights.IMAGENET1K_V1"})
+    )
+    return folder
+
+
+def test_evaluate_takes_a_policy_of_lerobot(run, act, tmp_path):
+    arguments = (f"--policy.path={act}", "--eval.n_episodes=2", "--eval.n_videos=0", "--output_dir=out")
+    result = run("relmm-eval", *SETTINGS, *arguments)
+    assert result.returncode == 0, result.stderr
+    episodes = json.loads((tmp_path / "out/eval_info.json").read_text())["per_episode"]
+    assert [episode["seed"] for episode in episodes] == [7, 8]
+    assert all(episode["navigation_steps"] == 15 for episode in episodes)
+
+
+def test_evaluate_refuses_a_policy_of_lerobot_that_has_learned_nothing(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["relmm-eval", "--policy.type=act", f"--output_dir={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit):
+        command.main()
+    assert (
+        capsys.readouterr()
+        .err.strip()
+        .endswith("relmm-eval: A policy act has to learn first: say --policy.path=FOLDER_OR_REPO.")
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            {"input_features": {"observation.state": {"type": "STATE", "shape": [7]}}},
+            "expects observation.state of (7,)",
+        ),
+        ({"dim_model": 32}, "cannot be loaded"),
+        ({"type": "walker"}, "is of a policy 'walker', and this loads act, "),
+    ],
+)
+def test_evaluate_refuses_a_policy_of_lerobot_that_does_not_fit(capsys, monkeypatch, act, tmp_path, change, words):
+    policy = shutil.copytree(act, tmp_path / "policy")
+    config = json.loads((policy / "config.json").read_text())
+    (policy / "config.json").write_text(json.dumps(config | change))
+    monkeypatch.setattr(sys, "argv", ["relmm-eval", f"--policy.path={policy}", f"--output_dir={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    errors = capsys.readouterr().err.strip()
+    assert stop.value.code == 2
+    assert words in errors
+    assert len(errors.splitlines()) == 1
+
+
+def test_steps_that_import_a_class_are_for_local_policies_of_others_only(act, tmp_path):
+    policy = shutil.copytree(act, tmp_path / "policy")
+    for trusted in (True, False):
+        check_any_policy_folder(policy, trusted)
+    path = policy / "policy_preprocessor.json"
+    pipeline = json.loads(path.read_text())
+    pipeline["steps"].append({"class": "somebody.steps.Step", "config": {}})
+    path.write_text(json.dumps(pipeline))
+    check_any_policy_folder(policy, trusted=True)
+    with pytest.raises(ConfigError, match=r"has a step 'somebody\.steps\.Step'"):
+        check_any_policy_folder(policy, trusted=False)
 
 
 def test_evaluate_films_the_arm_too(run, tmp_path):

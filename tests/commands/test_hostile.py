@@ -96,7 +96,7 @@ def replaced(name: str, content: bytes) -> Callable[[dict[str, bytes]], object]:
 
 
 DAMAGES: dict[str, tuple[Callable[[dict[str, bytes]], object], str]] = {
-    "another class": (changed_config(type="act"), "a policy 'act', and relmm's commands load relmm, "),
+    "another class": (changed_config(type="walker"), "a policy 'walker', and this loads act, "),
     "no such class": (changed_config(type="os.system"), "a policy 'os.system'"),
     "no class": (replaced("config.json", b"{}"), "a policy None"),
     "another controller": (changed_config(type="relmm_random", num_grasp=2), "No policy can be loaded"),

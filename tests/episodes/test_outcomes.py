@@ -49,15 +49,16 @@ def test_a_grasp_has_worked_if_something_is_held_in_the_next_frame_of_its_episod
     assert [len(episode) for episode in EpisodeFollower(stock).poll()] == [5, 3, 0]
 
 
-def test_only_what_is_missing_is_made(stock, tmp_path):
+def test_only_what_is_missing_is_made(stock):
     table = pq.read_table(stock / DATA.format(0), partitioning=None)
-    whole, known = with_outcomes(table)
+    whole, known = with_outcomes(table, DERIVED)
     assert set(DERIVED) <= set(whole.column_names)
     assert known.tolist() == [True] * 5 + [False]
-    again, known = with_outcomes(whole.drop_columns(["complementary_info.phase"]))
+    again, known = with_outcomes(whole.drop_columns(["complementary_info.phase"]), DERIVED)
     assert known.all()
     assert again["next.reward"].equals(whole["next.reward"])
-    assert with_outcomes(whole)[0] is whole
+    assert with_outcomes(table, ())[0] is table
+    assert with_outcomes(whole, DERIVED)[0] is whole
 
 
 def test_the_summary_counts_the_same_successes(stock):

@@ -11,7 +11,9 @@ import pytest
 from episode_helpers import INFO, REPO_ID, check_dataset, check_episode, length_of, load, new_dataset, record
 
 from relmm.episodes import DurableDataset, FrameBuilder, local_root, read_episodes, summarize, upload_dataset
+from relmm.episodes.card import dataset_card
 from relmm.episodes.compact import compact
+from relmm.episodes.folder import DatasetFolder
 from relmm.errors import ConfigError, DatasetError, HubError
 from relmm.features import DATASET_COLUMNS, dataset_features
 
@@ -266,3 +268,12 @@ def test_names_that_the_hub_refuses(tmp_path, hub):
 
 def test_lengths_differ():
     assert len({length_of(episode) for episode in range(3)}) == 3
+
+
+@pytest.mark.parametrize(("mode", "words"), [("practice", "from the pseudo-reset after one"), ("clean", "is one room")])
+def test_the_card_says_what_an_episode_is(tmp_path, mode, words):
+    with DurableDataset.create(REPO_ID, tmp_path / "d", False, "locobot_sim", INFO | {"mode": mode}) as dataset:
+        record(dataset, range(1))
+    text = dataset_card(DatasetFolder(tmp_path / "d"), NAME, "apache-2.0", contact_sheet=False).text
+    assert text.count("An episode ") == 1
+    assert f"An episode {'goes ' if mode == 'practice' else ''}{words}" in text
