@@ -12,11 +12,8 @@ from lerobot.envs.configs import EnvConfig
 
 from relmm.errors import MANY, check_range
 from relmm.features import ACTION_NAMES, FRONT, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
+from relmm.sim import ENV_ID
 from relmm.sim.config_locobot_sim import LocobotSimConfig
-
-ENV_ID = "gym_relmm_room/Room-v0"
-if ENV_ID not in gym.registry:
-    gym.register(ENV_ID, entry_point="relmm.sim.env:RelmmRoomEnv")
 
 
 class OneEpisode(gym.Wrapper[Any, Any, Any, Any]):
@@ -50,7 +47,7 @@ class OneEpisode(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _make_room(gym_kwargs: dict[str, Any]) -> gym.Env[Any, Any]:
-    """A room; defined here so that worker processes, which look it up by name, register the environment first."""
+    """A room; a function of a module, which worker processes look up by name."""
     return OneEpisode(gym.make(ENV_ID, disable_env_checker=True, **gym_kwargs))
 
 

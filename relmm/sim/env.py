@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from relmm.errors import ConfigError
 from relmm.features import ACTION_NAMES, FREE_GRASPS, FRONT, IMAGE_SIZE, MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES, Skill
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.film import Scene
@@ -30,6 +31,9 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         navigation_steps: length of an episode. Up to two grasp attempts after a navigation step are free, further ones
             count as a step.
         render_mode: `rgb_array` or None.
+
+    Raises:
+        ConfigError: settings that cannot work.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium reads it from the class)
@@ -44,6 +48,11 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         navigation_steps: int = 250,
         render_mode: str | None = None,
     ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(
+                f"render_mode is {render_mode!r}, but must be rgb_array or None: show what render() returns, or make "
+                "the room by gymnasium.make, which shows it itself if pygame is installed."
+            )
         self.render_mode = render_mode
         self.navigation_steps = navigation_steps
         # An upper bound on calls of `step`, which LeRobot asks for: each navigation step, its free grasps, a placement.

@@ -21,8 +21,8 @@ from relmm.features import (
     action_dict,
     in_grasp_area,
 )
-from relmm.sim import rooms
-from relmm.sim.config_relmm_room import ENV_ID, RelmmRoomEnvConfig
+from relmm.sim import ENV_ID, rooms
+from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
 from relmm.sim.env import RelmmRoomEnv
 from relmm.sim.rooms import Room, register_room, set_objects
 
@@ -90,6 +90,11 @@ def test_pictures_are_rendered_only_on_request() -> None:
     env.reset(seed=0)
     assert env.render() is None
     env.close()
+
+
+def test_a_window_is_refused_in_a_sentence() -> None:
+    with pytest.raises(ConfigError, match="render_mode is 'human', but must be rgb_array or None: show what render"):
+        RelmmRoomEnv(render_mode="human")
 
 
 def test_closing_twice_does_nothing(env: RelmmRoomEnv) -> None:
