@@ -40,28 +40,37 @@ def main() -> None:
     flags = argparse.ArgumentParser(description=__doc__)
     flags.add_argument("--cases", type=int, default=10_000)
     flags.add_argument("--seed", type=int, default=0)
-    flags.add_argument("--only", default="", help="a part of the names of kinds")
+    flags.add_argument("--only", default="", help="a part of the names of kinds, whose rows are replaced")
     flags.add_argument("--csv", default=str(Path(__file__).parent / "results" / "fuzz.csv"), help="nothing for none")
     options = flags.parse_args()
     logging.disable(logging.CRITICAL)
     warnings.simplefilter("ignore")
-    kinds = [kind for kind in (*FILES, *COMMANDS) if options.only in kind]
+    rows = _rows(Path(options.csv)) if options.csv and options.only else {}
     with tempfile.TemporaryDirectory(prefix="relmm-fuzz-") as temporary:
         healthy = prepare(Path(temporary) / "healthy")
-        share = options.cases / sum(1 / SLOWNESS[kind] for kind in kinds)
-        rows = []
-        for number, kind in enumerate(kinds):
-            rng = np.random.default_rng([options.seed, number])
-            rows.append(row_of(kind, math.ceil(share / SLOWNESS[kind]), rng, healthy))
-    total = {"kind": "all", **{name: sum(row[name] for row in rows) for name in _COLUMNS[1:-1]}}
-    rows.append({**total, "slowest_s": max(row["slowest_s"] for row in rows)})
-    print(" | ".join(str(value) for value in rows[-1].values()))
+        share = options.cases / sum(1 / slowness for slowness in SLOWNESS.values())
+        for number, (kind, slowness) in enumerate(SLOWNESS.items()):
+            if options.only in kind:
+                rng = np.random.default_rng([options.seed, number])
+                rows[kind] = row_of(kind, math.ceil(share / slowness), rng, healthy)
+    total = {"kind": "all", **{name: sum(row[name] for row in rows.values()) for name in _COLUMNS[1:-1]}}
+    rows["all"] = {**total, "slowest_s": max(row["slowest_s"] for row in rows.values())}
+    print(" | ".join(str(value) for value in rows["all"].values()))
     if options.csv:
         with Path(options.csv).open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, _COLUMNS)
             writer.writeheader()
-            writer.writerows(rows)
-    sys.exit(rows[-1]["tracebacks"] > 0)
+            writer.writerows(rows.values())
+    sys.exit(rows["all"]["tracebacks"] > 0)
+
+
+def _rows(file: Path) -> dict[str, dict[str, Any]]:
+    """Those of an earlier run, without their sum."""
+    with file.open(newline="", encoding="utf-8") as lines:
+        rows = {row["kind"]: row for row in csv.DictReader(lines)}
+    rows.pop("all")
+    counts = {kind: {name: int(row[name]) for name in _COLUMNS[1:-1]} for kind, row in rows.items()}
+    return {kind: {"kind": kind, **counts[kind], "slowest_s": float(rows[kind]["slowest_s"])} for kind in rows}
 
 
 def row_of(kind: str, cases: int, rng: np.random.Generator, healthy: Healthy) -> dict[str, Any]:

@@ -121,6 +121,7 @@ class DatasetFolder:
         """A JSON object of the dataset; None when the file is missing, cut off or something else."""
         try:
             data = json.loads((self.root / name).read_text(encoding="utf-8"))
+            json.dumps(data, ensure_ascii=False).encode()  # half a character could be read, but not written again
         except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
             return None
         return data if isinstance(data, dict) else None

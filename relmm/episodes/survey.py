@@ -68,7 +68,10 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table | None:
 def read_places(path: Path) -> pa.Table | None:
     """`PLACE_COLUMNS` of a file of meta/episodes; None also where they are not whole numbers."""
     table = read_columns(path, PLACE_COLUMNS)
-    return table if table is not None and are_whole_numbers(table, PLACE_COLUMNS[:-1]) else None
+    if table is None or not are_whole_numbers(table, PLACE_COLUMNS[:-1]):
+        return None
+    tasks = table["tasks"]
+    return table if pa.types.is_list(tasks.type) and tasks.null_count == 0 else None
 
 
 def survey(folder: DatasetFolder, data_path: str) -> Survey:

@@ -119,7 +119,9 @@ def read_json(path: Path) -> Any:
     try:
         if path.stat().st_size > _MAX_JSON:
             raise ConfigError(f"{path} has {path.stat().st_size / 1e6:.0f} MB, which no policy needs; do not use it.")
-        return json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8"))
+        json.dumps(data, ensure_ascii=False).encode()  # half a character could be read, but not written again
+        return data
     except FileNotFoundError as error:
         raise ConfigError(
             f"{path.parent} has no {path.name}: give the folder of a checkpoint's pretrained_model."
