@@ -233,7 +233,7 @@ class _DataFiles:
             raise DatasetError(f"a picture of episode {index} in {where} cannot be read: {error}.") from error
         try:
             frames, known = with_outcomes(frames, TRAINING_COLUMNS)
-            if not known[-1] and len(frames) > 1:  # it teaches nothing, and would count as a failure
+            if not known[-1]:  # it teaches nothing, and would count as a failure
                 images, frames = images[:-1], frames.slice(0, len(frames) - 1)
             return self._checked(index, images, frames)
         except _WRONG_TYPES as error:

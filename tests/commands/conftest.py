@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> Run:
             cwd=tmp_path,
             env={**os.environ, **environment},
             stdin=subprocess.DEVNULL,
-            timeout=110,
+            timeout=550,
         )
 
     return call

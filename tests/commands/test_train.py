@@ -226,11 +226,11 @@ def test_dataset_that_cannot_be_trained_on_is_refused(tmp_path, refused, finishe
     data, folder = tmp_path / "data", tmp_path / "run"
     shutil.copytree(finished / "dataset", data)
     info = json.loads((data / "meta/info.json").read_text())
-    del info["features"]["next.reward"]
+    del info["features"]["action"]
     (data / "meta/info.json").write_text(json.dumps(info))
     learner = [argument for argument in tiny if option == "init" or not argument.startswith("--robot.")]
     words = refused(*learner, f"--dataset.{option}={data}", f"--output_dir={folder}")
-    assert "column next.reward: have no such column" in words
+    assert "column action: have no such column" in words
     assert not folder.exists()
 
 

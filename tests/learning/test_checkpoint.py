@@ -165,7 +165,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_last_checkpoint(tmp_path):
     """Whatever file is the first that does not fit."""
     actor, learner = make_learner()
     work(learner, 1)
-    save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {"episodes": 1}, {})
+    save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {"episodes": 1}, {}, [])
     sizes = {path.stat().st_size for path in (tmp_path / "000001").rglob("*") if path.is_file()}
     previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond the limit then fails with EFBIG
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -173,20 +173,20 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_last_checkpoint(tmp_path):
         for size in sizes:
             resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, hard))
             with pytest.raises(DiskError, match="make room") as caught:
-                save_checkpoint(tmp_path, 2, actor, learner, np.random.default_rng(0), {"episodes": 2}, {})
+                save_checkpoint(tmp_path, 2, actor, learner, np.random.default_rng(0), {"episodes": 2}, {}, [])
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
             assert "\n" not in str(caught.value)
             assert last_checkpoint(tmp_path).name == "000001"
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, previous)
-    save_checkpoint(tmp_path, 2, actor, learner, np.random.default_rng(0), {"episodes": 2}, {})
+    save_checkpoint(tmp_path, 2, actor, learner, np.random.default_rng(0), {"episodes": 2}, {}, [])
     assert load_training_state(last_checkpoint(tmp_path), learner, np.random.default_rng(0)) == {"episodes": 2}
 
 
 def test_a_checkpoint_without_check_sums_still_loads(tmp_path):
     actor, learner = make_learner()
-    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {"episodes": 1}, {})
+    folder = save_checkpoint(tmp_path, 1, actor, learner, np.random.default_rng(0), {"episodes": 1}, {}, [])
     for sums in folder.rglob("SHA256SUMS"):
         sums.unlink()
     check_policy_folder(pretrained_model(folder))
