@@ -78,5 +78,5 @@ def with_outcomes(frames: pa.Table, wanted: Container[str]) -> tuple[pa.Table, N
 
 def _numbers(frames: pa.Table, key: str, width: int) -> FloatArray:
     """A column of lists, (n, width)."""
-    numbers: FloatArray = frames[key].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-    return numbers.reshape(len(frames), width)
+    numbers = frames[key].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    return numbers.astype(np.float32).reshape(len(frames), width)
