@@ -110,6 +110,27 @@ def action_dict(
     return dict(zip(ACTION_NAMES, (x_vel, theta_vel, float(skill), x, y), strict=True))
 
 
+def carried_out(commands: FloatArray, holding: NDArray[np.bool_]) -> FloatArray:
+    """What a robot does on commands: speeds within its limits, the nearest skill, and nothing where it refuses.
+
+    It refuses to grasp with a full gripper and to place with an empty one: it stands still for a navigation step.
+
+    Args:
+        commands: by `ACTION_NAMES`, (n, 5); not changed.
+        holding: whether it holds something before each, (n,).
+
+    Returns:
+        The actions, (n, 5).
+    """
+    low, high = [0.0, -MAX_THETA_VEL, min(Skill)], [MAX_X_VEL, MAX_THETA_VEL, max(Skill)]
+    actions = commands.copy()
+    actions[:, :3] = np.clip(actions[:, :3], low, high)
+    skills = actions[:, 2] = actions[:, 2].round()
+    refused = ((skills == Skill.GRASP) & holding) | ((skills == Skill.PLACE) & ~holding)
+    actions[refused] = list(action_dict().values())
+    return actions
+
+
 # --- Datasets ------------------------------------------------------------------------------------------------
 # What a policy believed when it decided (`complementary_info.<name>`), -1 where it has no opinion: P[grasp], and mean
 # and standard deviation over the ensemble at the attempted cell.

@@ -22,6 +22,7 @@ from relmm.features import (
     STATE_NAMES,
     Skill,
     action_dict,
+    carried_out,
     cell_to_xy,
     dataset_features,
     in_grasp_area,
@@ -112,3 +113,21 @@ def test_each_picture_keeps_what_is_known_about_its_camera() -> None:
     for key, depth in ((IMAGE_KEY, False), (DEPTH_KEY, True)):
         assert unknown[key]["info"] == {"is_depth_map": depth}
         assert known[key]["info"] == {"is_depth_map": depth, "camera": {"name": "mine"}}
+
+
+@pytest.mark.parametrize(
+    ("command", "holding", "done"),
+    [
+        ((0.9, -200.0, 0.3, 0.0, 0.0), False, (MAX_X_VEL, -MAX_THETA_VEL, Skill.NAVIGATE, 0.0, 0.0)),
+        ((-0.9, 20.0, -0.7, 0.0, 0.0), True, (0.0, 20.0, Skill.NAVIGATE, 0.0, 0.0)),
+        ((0.1, 0.0, 1.2, 0.4, 0.05), False, (0.1, 0.0, Skill.GRASP, 0.4, 0.05)),
+        ((0.1, 9.0, 1.0, 0.4, 0.05), True, (0.0, 0.0, Skill.NAVIGATE, 0.0, 0.0)),
+        ((0.0, 0.0, 7.0, 0.4, 0.05), True, (0.0, 0.0, Skill.PLACE, 0.4, 0.05)),
+        ((0.1, 9.0, 2.0, 0.4, 0.05), False, (0.0, 0.0, Skill.NAVIGATE, 0.0, 0.0)),
+    ],
+    ids=str,
+)
+def test_what_a_command_comes_to(command: tuple[float, ...], holding: bool, done: tuple[float, ...]) -> None:
+    given = np.array([command])
+    np.testing.assert_allclose(carried_out(given, np.array([holding])), [done])
+    assert given.tolist() == [list(command)]

@@ -1,7 +1,8 @@
 """How each frame ended, also where LeRobot's own recorder has not written it down.
 
 Whether a grasp worked can be seen in the next observation of its episode, where the robot says whether it holds
-something. Nothing follows on an episode's last frame: what a grasp there came to is not known.
+something. Nothing follows on an episode's last frame: what a grasp there came to is not known. LeRobot's recorder keeps
+what was commanded; what was done is less where the robot refuses.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from relmm.features import ACTION_NAMES, FPS, STATE_KEY, STATE_NAMES, Phase, Skill
+from relmm.features import ACTION_NAMES, FPS, STATE_KEY, STATE_NAMES, FloatArray, Phase, Skill, carried_out
 
 _SKILL, _HOLDING = ACTION_NAMES.index("skill.pos"), STATE_NAMES.index("holding.pos")
 # The columns that `with_outcomes` makes where they are missing, and those that it makes them from.
@@ -29,7 +30,7 @@ SOURCES = ("action", STATE_KEY, "episode_index")
 
 
 def with_outcomes(frames: pa.Table, wanted: Container[str]) -> tuple[pa.Table, NDArray[np.bool_]]:
-    """Add those columns of `DERIVED` that are wanted and missing.
+    """Add those columns of `DERIVED` that are wanted and missing; without rewards, `action` becomes what was done.
 
     Where nobody wrote down who acted, the policy did; where nobody looked at the robot's clock, a frame lasts as long
     as a navigation step, which is the least it can.
@@ -50,11 +51,14 @@ def with_outcomes(frames: pa.Table, wanted: Container[str]) -> tuple[pa.Table, N
         return frames, known
     episode = frames["episode_index"].to_numpy()
     last = np.append(episode[1:] != episode[:-1], True)
-    grasp = _column(frames, "action", len(ACTION_NAMES), _SKILL).round() == Skill.GRASP
-    held_after = np.append(_column(frames, STATE_KEY, len(STATE_NAMES), _HOLDING)[1:] > 0.5, False)
-    success = grasp & held_after & ~last
+    holding = _numbers(frames, STATE_KEY, len(STATE_NAMES))[:, _HOLDING] > 0.5
+    actions = carried_out(_numbers(frames, "action", len(ACTION_NAMES)), holding)
+    grasp = actions[:, _SKILL] == Skill.GRASP
+    success = grasp & np.append(holding[1:], False) & ~last
     if "next.reward" in missing:
         known = ~(grasp & last)
+        done = pa.FixedSizeListArray.from_arrays(pa.array(actions.ravel()), len(ACTION_NAMES))
+        frames = frames.set_column(frames.column_names.index("action"), "action", done)
     first = np.flatnonzero(np.roll(last, 1))
     number = np.arange(len(frames)) - np.repeat(first, np.diff(np.append(first, len(frames))))
     values = {
@@ -72,7 +76,7 @@ def with_outcomes(frames: pa.Table, wanted: Container[str]) -> tuple[pa.Table, N
     return frames, known
 
 
-def _column(frames: pa.Table, key: str, width: int, which: int) -> NDArray[np.float32]:
-    """One of the numbers that a column holds a list of."""
+def _numbers(frames: pa.Table, key: str, width: int) -> FloatArray:
+    """A column of lists, (n, width)."""
     numbers = frames[key].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-    return numbers.reshape(len(frames), width)[:, which]
+    return numbers.astype(np.float32).reshape(len(frames), width)

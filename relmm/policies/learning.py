@@ -167,10 +167,10 @@ class Learner(ABC):
 
 
 def no_rewards() -> ConfigError:
-    """What to say of batches without `next.reward`: single frames do not tell whether the grasp worked."""
+    """What to say of batches that tell nothing of how grasps ended."""
     return ConfigError(
-        "The dataset has no column next.reward, and lerobot-train shows a policy no frame together with the next one, "
-        "which would tell whether a grasp worked: learn from this dataset by relmm-train --dataset.init=FOLDER_OR_REPO."
+        "The dataset has no column next.reward, nor observation.state and frame numbers to tell how grasps ended: "
+        "record one with relmm-record, or with lerobot-record and --robot.type=locobot_sim."
     )
 
 

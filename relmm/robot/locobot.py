@@ -198,7 +198,8 @@ class LocobotRobot(Robot):
         if skill == Skill.PLACE and holding:
             return self._place(values["skill_x.pos"], values["skill_y.pos"])
         if skill != Skill.NAVIGATE:
-            logger.warning("Nothing was %s: the gripper %s.", *_refusal(skill))
+            # No warning: a learner that tries things out meets it at every third step, and is told what was done.
+            logger.info("Nothing was %s: the gripper %s.", *_refusal(skill))
             values = action_dict()
         x_vel = _clip(values["x.vel"], (0.0, MAX_X_VEL))
         theta_vel = _clip(values["theta.vel"], (-MAX_THETA_VEL, MAX_THETA_VEL))

@@ -55,8 +55,9 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             )
         self.render_mode = render_mode
         self.navigation_steps = navigation_steps
-        # An upper bound on calls of `step`, which LeRobot asks for: each navigation step, its free grasps, a placement.
-        self._max_episode_steps = navigation_steps * (2 + FREE_GRASPS)
+        # An upper bound on calls of `step`, which LeRobot asks for: each navigation step, and its free grasps, each
+        # with the placement of what it picked up.
+        self._max_episode_steps = navigation_steps * (1 + 2 * FREE_GRASPS)
         self.robot = LocobotSim(LocobotSimConfig(room=room, num_objects=num_objects, camera=camera))
         self._scene: Scene | None = None
         limit = np.array([MAX_X_VEL, MAX_THETA_VEL, max(Skill), _REACH, _REACH], np.float32)

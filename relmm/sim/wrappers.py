@@ -6,10 +6,19 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import RescaleAction
 from numpy.typing import NDArray
 
-from relmm.features import FRONT
+from relmm.features import (
+    ACTION_NAMES,
+    BASKET_XY,
+    FRONT,
+    GRASP_X,
+    GRASP_Y,
+    MAX_THETA_VEL,
+    MAX_X_VEL,
+    Skill,
+    action_dict,
+)
 
 
 class FlatObservation(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -33,6 +42,32 @@ class FlatObservation(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordCon
         return {FRONT: observation["pixels"][FRONT], "state": observation["agent_pos"]}
 
 
+class SkillActions(gym.ActionWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Actions of -1..1, by `relmm.features.ACTION_NAMES`, of which every one does something sensible.
+
+    Speeds are stretched to the robot's limits; the skill is the third of the range that its number lies in, navigate,
+    grasp, place; a grasp's two numbers are stretched to where the arm can grasp; and a placement goes into the basket:
+    all that the reward counts, and 0.2 % of the floor that a placement could otherwise be at.
+
+    Args:
+        env: a `RelmmRoomEnv`, or one wrapped.
+    """
+
+    def __init__(self, env: gym.Env[Any, NDArray[np.float32]]) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.ActionWrapper.__init__(self, env)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
+
+    def action(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See the class."""
+        drive, turn, skill, forward, left = ((np.clip(action, -1, 1) + 1) / 2).tolist()
+        chosen = Skill(min(int(skill * len(Skill)), max(Skill)))
+        place = (np.interp(forward, (0, 1), GRASP_X), np.interp(left, (0, 1), GRASP_Y))
+        x, y = BASKET_XY if chosen == Skill.PLACE else place
+        values = action_dict(chosen, drive * MAX_X_VEL, (2 * turn - 1) * MAX_THETA_VEL, float(x), float(y))
+        return np.array(list(values.values()), np.float32)
+
+
 def standard_spaces(env: gym.Env[dict[str, Any], NDArray[np.float32]]) -> gym.Env[Any, Any]:
-    """A room with `FlatObservation` and with actions of -1..1, which are stretched to the ranges of the robot's."""
-    return RescaleAction(FlatObservation(env), np.float32(-1), np.float32(1))
+    """A room with `FlatObservation` and `SkillActions`."""
+    return SkillActions(FlatObservation(env))

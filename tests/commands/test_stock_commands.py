@@ -35,7 +35,7 @@ def recorded(tmp_path_factory) -> Path:
 
 
 @pytest.mark.timeout(300)  # several commands, one after the other
-def test_relmm_train_learns_from_what_lerobot_record_has_recorded(run, tmp_path):
+def test_what_lerobot_record_has_recorded_can_be_learned_from(run, tmp_path):
     """At LeRobot's own frame rate, and without the columns that only relmm writes."""
     result = run(
         "lerobot-record",
@@ -77,6 +77,22 @@ def test_relmm_train_learns_from_what_lerobot_record_has_recorded(run, tmp_path)
     )
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "learned/checkpoints/last/pretrained_model/model.safetensors").exists()
+    result = run(
+        "lerobot-train",
+        "--policy.type=relmm",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=me/room",
+        "--dataset.root=room",
+        "--batch_size=64",
+        "--num_workers=0",
+        "--steps=1",
+        "--log_freq=1",
+        "--env_eval_freq=0",
+        "--output_dir=stock",
+    )
+    assert result.returncode == 0, result.stderr
+    assert "loss:0.000" not in result.stderr + result.stdout, "it has found attempts that it could learn from"
 
 
 def test_lerobot_replay(run, recorded):

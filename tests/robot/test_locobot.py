@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 
 import mujoco
@@ -23,6 +24,7 @@ from relmm.features import (
     STATE_NAMES,
     Skill,
     action_dict,
+    carried_out,
 )
 from relmm.robot.locobot import LocobotRobot
 from relmm.robot.skills import REST_POSE
@@ -181,6 +183,20 @@ def test_a_placement_with_an_empty_gripper_stands_still(robot: LocobotSim) -> No
     before = robot.body.truth.robot()
     assert robot.send_action(action_dict(Skill.PLACE, x_vel=0.4, x=0.4)) == STILL
     assert robot.body.truth.robot() == pytest.approx(before, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "action",
+    [action_dict(x_vel=9.0, theta_vel=-900.0), action_dict(Skill.PLACE, x_vel=0.4, x=0.4)],
+    ids=["drive", "place"],
+)
+def test_what_is_done_is_what_a_recorded_command_is_taken_for(
+    robot: LocobotSim, action: dict[str, float], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Where LeRobot's recorder has kept the command only; and it is nothing to warn of at every step."""
+    taken_for = carried_out(np.array([list(action.values())]), np.array([False]))[0]
+    assert list(robot.send_action(action).values()) == pytest.approx(taken_for)
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
 
 
 def test_holding_is_observed(holding: LocobotSim) -> None:

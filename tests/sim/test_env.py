@@ -149,6 +149,11 @@ def test_putting_down_and_grasping_again_earns_nothing(env: RelmmRoomEnv) -> Non
     assert rewards == [0.0] * 6
 
 
+def test_lerobot_steps_long_enough_for_the_busiest_episode(env: RelmmRoomEnv) -> None:
+    """After each of 6 navigation steps two grasps that succeed, and both things are put into the basket."""
+    assert env._max_episode_steps == 6 * (1 + 2 + 2)
+
+
 def test_an_empty_grasp_counts_as_an_attempt_and_earns_nothing(env: RelmmRoomEnv) -> None:
     _, reward, _, _, info = act(env, Skill.GRASP, x=GRASP_X[0], y=0.0)
     assert reward == 0.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from relmm.features import MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES
+from relmm.features import BASKET_XY, GRASP_X, GRASP_Y, MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES, Skill
 from relmm.sim import ENV_ID
 from relmm.sim.wrappers import standard_spaces
 
@@ -39,18 +39,33 @@ def test_spaces_are_what_stable_baselines3_takes(env: gym.Env[Any, Any]) -> None
     assert env.observation_space.contains(env.step(env.action_space.sample())[0])
 
 
-def test_actions_are_stretched_to_the_ranges_of_the_robot(
+def test_actions_are_stretched_to_what_the_robot_can_do(
     env: gym.Env[Any, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env.reset(seed=0)
     robot, sent = env.unwrapped.robot, []  # type: ignore[attr-defined]
-    send = robot.send_action
-    monkeypatch.setattr(robot, "send_action", lambda action: send(sent.append(action) or action))
-    for action in ([-1, -1, -1, -1, -1], [1, 1, -1, 0, 0]):
+    monkeypatch.setattr(robot, "send_action", lambda action: sent.append(action) or action)
+    ends = ([-1] * 5, [1, 1, -1, 1, 1], [0, 0, 0, -1, 1], [0, 0, 1, 0.3, -0.7], [9, -9, -0.4, 9, -9])
+    for action in ends:
         env.step(np.array(action, np.float32))
-    low, high = (list(action.values()) for action in sent)
-    np.testing.assert_allclose(low, [0, -MAX_THETA_VEL, 0, -1, -1], atol=1e-5)
-    np.testing.assert_allclose(high, [MAX_X_VEL, MAX_THETA_VEL, 0, 0, 0], atol=1e-5)
+    wanted = [
+        [0, -MAX_THETA_VEL, Skill.NAVIGATE, GRASP_X[0], GRASP_Y[0]],
+        [MAX_X_VEL, MAX_THETA_VEL, Skill.NAVIGATE, GRASP_X[1], GRASP_Y[1]],
+        [MAX_X_VEL / 2, 0, Skill.GRASP, GRASP_X[0], GRASP_Y[1]],
+        [MAX_X_VEL / 2, 0, Skill.PLACE, *BASKET_XY],
+        [MAX_X_VEL, -MAX_THETA_VEL, Skill.NAVIGATE, GRASP_X[1], GRASP_Y[0]],
+    ]
+    np.testing.assert_allclose([list(action.values()) for action in sent], wanted, atol=1e-5)
+
+
+def test_a_grasp_and_any_placement_after_it_are_rewarded(env: gym.Env[Any, Any]) -> None:
+    """So that a learner which acts at random comes upon a reward now and then."""
+    env.reset(seed=0)
+    robot = env.unwrapped.robot  # type: ignore[attr-defined]
+    robot.body.put_object(0, np.array([np.mean(GRASP_X), 0.0]))
+    robot.skills.forget_picture()
+    rewards = [env.step(np.array([0.2, 0.2, skill, 0, 0], np.float32))[1] for skill in (0.1, 0.9)]
+    assert rewards == [0.0, 1.0]
 
 
 def test_one_import_is_all_that_gymnasium_needs() -> None:

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from relmm.features import (
-    ACTION_NAMES,
     DRIVE_PULSE_S,
     GRID,
-    IMAGE_KEY,
     MOTION,
     SCAN,
     STATE_NAMES,
@@ -23,7 +21,7 @@ from relmm.features import (
     cell_to_xy,
 )
 from relmm.policies.controller import Row, grasp_cell
-from relmm.policies.learning import LearningPolicy, no_rewards
+from relmm.policies.learning import LearningPolicy
 from relmm.policies.pseudo_reset import PLACE_XY
 from relmm.policies.relmm.carrying import choose_place, is_there
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
@@ -32,10 +30,10 @@ from relmm.policies.relmm.grasping import FIRST_COLUMN, FIRST_ROW, GraspEnsemble
 from relmm.policies.relmm.learner import Attempts, ReLMMLearner
 from relmm.policies.relmm.memory import FloorGrid, FloorMemory
 from relmm.policies.relmm.mind import Mind
+from relmm.policies.relmm.offline import BatchReader
 from relmm.policies.relmm.planning import Planner, find_things
 
 _HOLDING = STATE_NAMES.index("holding.pos")
-_SKILL = ACTION_NAMES.index("skill.pos")
 _CELLS = cell_to_xy(np.arange(GRID**2, dtype=float))  # m, robot frame, (225, 2)
 _TO_MOTION = DRIVE_PULSE_S * np.array([1.0, 1.0, np.pi / 180])  # from m/s, m/s, deg/s to m, m, rad
 _CAPACITY = 2**15  # attempts that `forward` remembers
@@ -61,7 +59,8 @@ class ReLMMPolicy(LearningPolicy):
         self.grid = FloorGrid(FIRST_ROW, FIRST_COLUMN, self.grasping.known.numpy())
         self.sampling = config.sample
         # Of `forward`.
-        self._attempts, self._rng = Attempts(_CAPACITY), np.random.default_rng(config.seed or 0)
+        self._attempts, self._batches = Attempts(_CAPACITY), BatchReader(self.grasping)
+        self._rng = np.random.default_rng(config.seed or 0)
         self._noise = torch.Generator().manual_seed(config.seed or 0)
 
     # --- Acting -------------------------------------------------------------------------------------------
@@ -166,21 +165,17 @@ class ReLMMPolicy(LearningPolicy):
         """The loss of attempts of a dataset: those of a LeRobot batch and, while training, of earlier ones.
 
         Args:
-            batch: pictures 0..1 (batch, 3, 100, 100), `action` (batch, 5), `next.reward` and `index` (batch,).
+            batch: pictures 0..1 (batch, 3, 100, 100), `action` (batch, 5), `next.reward` and `index` (batch,); without
+                `next.reward`, also `observation.state` and `episode_index`, which tell it sooner or later.
             **kwargs: LeRobot's, not used.
 
         Raises:
-            ConfigError: the dataset has no rewards.
+            ConfigError: the dataset has no rewards, nor what tells them.
         """
-        if not isinstance(batch.get("next.reward"), Tensor):  # LeRobot puts in the number 0 where there is no column
-            raise no_rewards()
         attempts = self._attempts if self.training else Attempts(len(batch["action"]))
-        rows = batch["action"][:, _SKILL].round() == Skill.GRASP
-        areas, actions = self.grasping.area(batch[IMAGE_KEY][rows]), batch["action"][rows].cpu().numpy()
-        successes = batch["next.reward"][rows].flatten().cpu().numpy() > 0.5
-        names = batch["index"][rows].flatten().tolist() if "index" in batch else [None] * len(areas)
-        for area, action, success, name in zip(areas, actions, successes, names, strict=True):
-            attempts.add(area, action, bool(success), name)
+        reader = self._batches if self.training else BatchReader(self.grasping)
+        for attempt, success in reader.read(batch):
+            attempts.add(attempt.area, attempt.action, success, attempt.index)
         if len(attempts) == 0:
             return torch.stack([weight.sum() * 0.0 for weight in self.grasping.learned()]).sum(), {}
         if self.training:

@@ -105,7 +105,8 @@ class RelmmPaperPolicy(LearningPolicy):
 
         Args:
             batch: pictures (batch, time, 3, 100, 100) 0..1, and which of them are padding; `action` (batch, time, 5),
-                where time is `config.observation_delta_indices`; `next.reward` and `index`, (batch,).
+                where time is `config.observation_delta_indices`; `index`, and `next.reward`, (batch,), or else
+                `observation.state`, (batch, time, 52).
             **kwargs: LeRobot's, not used.
         """
         attempts, new_steps = read_batch(batch)

@@ -9,11 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from relmm.features import ACTION_NAMES, IMAGE_KEY, Skill, xy_to_cell
+from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_KEY, STATE_NAMES, Skill, carried_out, xy_to_cell
 from relmm.policies.learning import no_rewards
 from relmm.policies.relmm_paper.navigation import from_navigation_steps
 
 _SKILL, _X, _Y = (ACTION_NAMES.index(name) for name in ("skill.pos", "skill_x.pos", "skill_y.pos"))
+_HOLDING = STATE_NAMES.index("holding.pos")
 _WAITING = 4096  # steps, each with two pictures of 30 kB; a dataset shows what is forgotten again
 
 Frame = tuple[int, int]  # the dataset, and the frame's number in it; pictures may be augmented, so they do not tell
@@ -56,13 +57,11 @@ def read_batch(batch: dict[str, Any]) -> tuple[list[Attempt], list[Step]]:
     """What the frames of a batch are, as `RelmmPaperPolicy.forward` takes it; placements are neither.
 
     Raises:
-        ConfigError: the dataset has no rewards.
+        ConfigError: the dataset has no rewards, nor states that tell them.
     """
-    if not isinstance(batch.get("next.reward"), Tensor):  # LeRobot puts in the number 0 where there is no column
-        raise no_rewards()
     pictures = (batch[IMAGE_KEY].clamp(0, 1) * 255).round().to(torch.uint8)  # (batch, time, 3, 100, 100)
-    actions, rewards = batch["action"].cpu(), batch["next.reward"].flatten().tolist()
     padded = batch[f"{IMAGE_KEY}_is_pad"].tolist()
+    actions, successes = _outcomes(batch, padded)
     indices = batch["index"].flatten().tolist()
     datasets = batch["dataset_index"].flatten().tolist() if "dataset_index" in batch else [0] * len(indices)
     attempts, steps = [], []
@@ -70,7 +69,9 @@ def read_batch(batch: dict[str, Any]) -> tuple[list[Attempt], list[Step]]:
         frames = [(datasets[row], first + time) for time in range(len(skills))]
         if skills[0] == Skill.GRASP:
             cell = xy_to_cell(*actions[row, 0, [_X, _Y]].tolist())
-            attempts.append(Attempt(frames[0], pictures[row, 0], cell, rewards[row] > 0))
+            success = successes[row]
+            if success is not None:
+                attempts.append(Attempt(frames[0], pictures[row, 0], cell, success))
         elif skills[0] == Skill.NAVIGATE:
             after = _after(skills, padded[row])
             # Not there are the picture after an episode's last frame, and what came of a curriculum's many attempts.
@@ -80,6 +81,19 @@ def read_batch(batch: dict[str, Any]) -> tuple[list[Attempt], list[Step]]:
                 action = from_navigation_steps(actions[row, :1])[0]
                 steps.append(Step(pictures[row, 0], action, following, frames[1:after]))
     return attempts, steps
+
+
+def _outcomes(batch: dict[str, Any], padded: list[list[bool]]) -> tuple[Tensor, list[bool | None]]:
+    """What was done, (batch, time, 5), and whether each row's frame picked something up, None where nobody can tell."""
+    actions, rewards = batch["action"].cpu(), batch.get("next.reward")
+    if isinstance(rewards, Tensor):  # LeRobot puts in the number 0 where there is no column
+        return actions, [reward > 0 for reward in rewards.flatten().tolist()]
+    if STATE_KEY not in batch:
+        raise no_rewards()
+    holding = batch[STATE_KEY][..., _HOLDING].cpu() > 0.5  # before each frame, (batch, time)
+    done = carried_out(actions.flatten(0, 1).numpy(), holding.flatten().numpy())
+    ended = [None if pads[1] else held for pads, held in zip(padded, holding[:, 1].tolist(), strict=True)]
+    return torch.from_numpy(done).reshape(actions.shape), ended
 
 
 def _after(skills: list[float], padded: list[bool]) -> int:

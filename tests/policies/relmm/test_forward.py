@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from relmm.errors import ConfigError
-from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_NAMES, Phase, Skill, action_dict
+from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phase, Skill, action_dict
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 
@@ -124,10 +124,48 @@ def test_a_batch_without_attempts_teaches_nothing_and_can_be_stepped_on(training
     assert all(torch.equal(*each) for each in zip(before, policy.get_optim_params(), strict=True))
 
 
-def test_a_dataset_without_rewards_is_refused(make_policy: MakePolicy) -> None:
-    batch = as_batch("ff")
-    for missing in (0.0, None):  # LeRobot's processors put in 0 where there is no column
-        with pytest.raises(ConfigError, match=r"no column next\.reward, .* relmm-train --dataset\.init="):
+def without_rewards(frames: str, held: str) -> dict[str, Any]:
+    """As `as_batch`, for an episode of LeRobot's own recorder: before each frame something is held (1) or not (0)."""
+    states = np.tile(STATE, (len(frames), 1))
+    states[:, STATE_NAMES.index("holding.pos")] = [float(each) for each in held]
+    return as_batch(frames) | {
+        "next.reward": 0.0,  # which LeRobot's processors put in where there is no column
+        STATE_KEY: torch.from_numpy(states),
+        "episode_index": torch.zeros(len(frames), dtype=torch.int64),
+    }
+
+
+def test_without_rewards_the_next_frame_tells(make_policy: MakePolicy) -> None:
+    """What the last grasp came to is not known, and a grasp with a full gripper is none."""
+    policy = make_policy().eval()
+    loss, _ = policy.forward(without_rewards("dfsfpff", "0001100"))
+    wanted, _ = policy.forward(as_batch("dfsdpfd"))
+    assert loss.item() == pytest.approx(wanted.item(), rel=1e-6)
+
+
+def test_without_rewards_an_attempt_waits_for_the_next_frame(make_policy: MakePolicy) -> None:
+    policy = make_policy().train()
+    batch = without_rewards("dsdfs", "00100")
+    known = []
+    for row in (1, 0, 4, 3, 2):
+        policy.forward(
+            {key: value[row : row + 1] if isinstance(value, Tensor) else value for key, value in batch.items()}
+        )
+        known.append(policy._attempts.all(torch.device("cpu"))[2].tolist())
+    assert known == [[], [], [], [False], [False, True]]
+
+
+def test_the_next_frame_is_one_of_the_same_episode(make_policy: MakePolicy) -> None:
+    policy, batch = make_policy().train(), without_rewards("sdf", "010")
+    policy.forward({**batch, "episode_index": torch.tensor([0, 1, 1])})
+    assert len(policy._attempts) == 0
+
+
+def test_a_dataset_that_does_not_tell_how_grasps_ended_is_refused(make_policy: MakePolicy) -> None:
+    batch = without_rewards("ff", "00")
+    del batch[STATE_KEY]
+    for missing in (0.0, None):
+        with pytest.raises(ConfigError, match=r"no column next\.reward, .* record one with relmm-record"):
             make_policy().forward({**batch, "next.reward": missing})
 
 

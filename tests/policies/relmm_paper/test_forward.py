@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from relmm.errors import ConfigError
-from relmm.features import FPS, IMAGE_KEY, STATE_NAMES, Phase, Skill
+from relmm.features import FPS, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phase, Skill
 from relmm.policies.relmm_paper.modeling_relmm_paper import RelmmPaperPolicy
 from relmm.policies.relmm_paper.navigation import NavigationBatch
 from relmm.policies.relmm_paper.replay import to_pictures
@@ -243,8 +243,23 @@ def test_forward_loses_no_success_to_image_augmentation(make_policy: MakePolicy,
     assert sum(int(given[2].sum()) for given in seen["grasping"]) == len(grasped)
 
 
+def test_without_rewards_the_next_frame_tells(make_policy: MakePolicy, as_batch) -> None:
+    """What the last grasp came to is not known, and a grasp with a full gripper is none."""
+    policy = make_policy(seed=2).eval()
+    told, batch = as_batch("dfsdpdf", [0, 1, 2, 4, 5]), as_batch("dfsfpdf", [0, 1, 2, 4, 5, 6])
+    states = torch.zeros(*batch["action"].shape[:2], len(STATE_NAMES))
+    for row, first in enumerate(batch["index"].tolist()):
+        for time in range(states.shape[1]):
+            states[row, time, STATE_NAMES.index("holding.pos")] = float(first + time in (3, 4))
+    losses = []
+    for each in ({**batch, "next.reward": 0.0, STATE_KEY: states}, told):
+        torch.manual_seed(3)
+        losses.append(policy.forward(each)[0].item())
+    assert losses[0] == pytest.approx(losses[1], rel=1e-6)
+
+
 def test_dataset_without_rewards_is_refused(make_policy: MakePolicy, as_batch) -> None:
     batch = as_batch("dd", [0])
     batch["next.reward"] = 0.0  # which LeRobot's processors put in where there is none
-    with pytest.raises(ConfigError, match=r"no column next\.reward, .* relmm-train --dataset\.init="):
+    with pytest.raises(ConfigError, match=r"no column next\.reward, .* record one with relmm-record"):
         make_policy().forward(batch)
