@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import draccus
 from tqdm import tqdm
 
+from relmm.commands.arguments import Arguments, said
 from relmm.errors import ConfigError, RelmmError
 
 _USAGE_ERROR = 2
@@ -28,7 +29,7 @@ def run[Config](
     command: str,
     config_class: type[Config],
     job: Callable[[Config], None],
-    prepare: Callable[[list[str]], None] = lambda arguments: None,
+    prepare: Callable[[Arguments], None] = lambda arguments: None,
 ) -> None:
     """Parse the command line into a config, do the job, and end with a sentence instead of a traceback.
 
@@ -41,7 +42,9 @@ def run[Config](
     _quiet()
     try:
         _register_plugins()
-        prepare(sys.argv)
+        arguments = said()
+        prepare(arguments)
+        arguments.hand_over()
         job(_parse(config_class))
     except (RelmmError, OSError) as error:
         print(f"{command}: {_sentence(error)}", file=sys.stderr)

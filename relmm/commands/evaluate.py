@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
+from relmm.commands.arguments import Arguments
 from relmm.commands.cli import dated_folder, progress, run
 from relmm.commands.policies import check_camera, make_actor, policy_from_path, take_seed
 from relmm.errors import ConfigError
@@ -208,10 +208,14 @@ def _write(folder: Path, scores: list[EpisodeScore]) -> None:
 
 
 def main() -> None:
-    """Entry point of `relmm-eval`; there is only one environment, so its type need not be said."""
-    if not any(argument.startswith(("--env.type", "--config_path")) for argument in sys.argv):
-        sys.argv.append("--env.type=relmm_room")
-    run("relmm-eval", EvalConfig, evaluate)
+    """Entry point of `relmm-eval`."""
+    run("relmm-eval", EvalConfig, evaluate, prepare=_prepare)
+
+
+def _prepare(arguments: Arguments) -> None:
+    """There is only one environment, so its type need not be said."""
+    if arguments.get("env.type") is None and arguments.get("config_path") is None:
+        arguments.set("env.type", "relmm_room")
 
 
 if __name__ == "__main__":

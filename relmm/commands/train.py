@@ -11,6 +11,7 @@ from typing import Any
 import draccus
 import numpy as np
 
+from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.curve import draw_learning_curve
 from relmm.commands.hub_resume import take_over_from_hub
@@ -350,7 +351,7 @@ def main() -> None:
     run("relmm-train", TrainConfig, train, prepare=_prepare)
 
 
-def _prepare(arguments: list[str]) -> None:
+def _prepare(arguments: Arguments) -> None:
     take_over_from_hub(arguments)
     resolve_config_path(arguments)
     choose_policy(arguments)

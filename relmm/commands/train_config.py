@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
+from relmm.commands.arguments import said
 from relmm.commands.cli import dated_folder
 from relmm.commands.policies import check_camera, policy_from_path
 from relmm.commands.upload import LICENSE
@@ -180,7 +180,7 @@ class TrainConfig:
         policy = self.policy
         assert policy is not None
         if policy.push_to_hub and policy.repo_id is None:
-            if parser.parse_arg("policy.push_to_hub") is not None:
+            if said().get("policy.push_to_hub") is not None:
                 raise ConfigError(
                     "Say where to upload the policy: --policy.push_to_hub=true --policy.repo_id=user/name."
                 )
