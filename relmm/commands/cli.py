@@ -20,6 +20,7 @@ import draccus
 from tqdm import tqdm
 
 from relmm.commands.arguments import Arguments, said
+from relmm.commands.terminal import lasting
 from relmm.errors import ConfigError, RelmmError
 
 _USAGE_ERROR = 2
@@ -39,19 +40,20 @@ def run[Config](
         job: what to do.
         prepare: may change the arguments before they are parsed.
     """
-    _quiet()
-    try:
-        _register_plugins()
-        arguments = said()
-        prepare(arguments)
-        arguments.hand_over()
-        job(_parse(config_class))
-    except (RelmmError, OSError) as error:
-        print(f"{command}: {_sentence(error)}", file=sys.stderr)
-        sys.exit(_USAGE_ERROR)
-    except KeyboardInterrupt:
-        print(f"{command}: interrupted.", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
+    with lasting():
+        _quiet()
+        try:
+            _register_plugins()
+            arguments = said()
+            prepare(arguments)
+            arguments.hand_over()
+            job(_parse(config_class))
+        except (RelmmError, OSError) as error:
+            print(f"{command}: {_sentence(error)}", file=sys.stderr)
+            sys.exit(_USAGE_ERROR)
+        except KeyboardInterrupt:
+            print(f"{command}: interrupted.", file=sys.stderr)
+            sys.exit(128 + signal.SIGINT)
 
 
 def _register_plugins() -> None:
@@ -123,29 +125,43 @@ def progress(total: int, unit: str, title: str | None = None, leave: bool = True
 
 
 class StopOnSignal:
-    """Notes the first SIGINT or SIGTERM instead of dying of it; a second one ends the process as usual."""
+    """Notes the first SIGINT, SIGTERM or SIGHUP instead of dying of it; a second one ends the process as usual.
+
+    Not a second SIGHUP: when a terminal goes away, the kernel and the shell both send one.
+
+    Attributes:
+        number: of the signal, None before there is one.
+    """
 
     def __init__(self) -> None:
-        self.stopped = False
+        self.number: int | None = None
         self._previous: dict[int, Any] = {}
 
+    @property
+    def stopped(self) -> bool:
+        """Whether to stop."""
+        return self.number is not None
+
     def __enter__(self) -> StopOnSignal:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._note)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+                self._previous[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._restore()
+        self._restore(*self._previous)
 
     def _note(self, number: int, frame: types.FrameType | None) -> None:
-        self.stopped = True
-        self._restore()
+        if self.stopped:
+            return
+        self.number = number
+        self._restore(signal.SIGINT, signal.SIGTERM)
         print("\nStopping: saving what there is (once more to stop at once).", file=sys.stderr)
 
-    def _restore(self) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        self._previous.clear()
+    def _restore(self, *numbers: int) -> None:
+        for number in numbers:
+            if number in self._previous:
+                signal.signal(number, self._previous.pop(number))
 
 
 def dated_folder(kind: str, name: str) -> Path:

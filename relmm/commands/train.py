@@ -315,11 +315,14 @@ def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
     if not isinstance(settings, LocobotSimConfig):
         return dict
     assert run.config.output_dir is not None
-    evaluation = RoomEvaluation(settings, run.actor, run.config.eval, run.config.output_dir / "eval")
+    evaluation = RoomEvaluation(
+        settings, run.actor, run.config.eval, run.config.output_dir / "eval", should_stop=lambda: run.signals.stopped
+    )
 
     def evaluate() -> dict[str, Any]:
         scores = evaluation(run.progress.steps)
-        bar.write(f"step {run.progress.steps}: collected {scores['eval_collected']:.1%} of the objects")
+        if scores:
+            bar.write(f"step {run.progress.steps}: collected {scores['eval_collected']:.1%} of the objects")
         return scores
 
     return evaluate
