@@ -41,9 +41,9 @@ class Arguments:
         return any(word in self._words for word in HELP)
 
     @property
-    def asks_for_all_help(self) -> bool:
-        """Whether `--help_all` is among them."""
-        return HELP_ALL in self._words
+    def asks_for_any_help(self) -> bool:
+        """Whether `--help_all` or `--help` is among them."""
+        return HELP_ALL in self._words or self.asks_for_help
 
     def get(self, name: str) -> str | None:
         """The value of an option, None if it was not said."""
@@ -68,7 +68,7 @@ class Arguments:
 
     def hand_over(self) -> None:
         """Make them what LeRobot's parser reads."""
-        sys.argv[1:] = ["--help" if word == HELP_ALL else word for word in self.words]
+        sys.argv[1:] = self.words
 
 
 def said() -> Arguments:

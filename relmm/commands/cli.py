@@ -20,6 +20,7 @@ import draccus
 from tqdm import tqdm
 
 from relmm.commands.arguments import Arguments, said
+from relmm.commands.options import bad_choice, listing, unknown_option
 from relmm.commands.terminal import lasting
 from relmm.errors import ConfigError, RelmmError
 
@@ -45,9 +46,12 @@ def run[Config](
         try:
             _register_plugins()
             arguments = said()
+            if arguments.asks_for_any_help:
+                print(listing(config_class, arguments))
+                return
             prepare(arguments)
             arguments.hand_over()
-            job(_parse(config_class))
+            job(_parse(config_class, arguments))
         except (RelmmError, OSError) as error:
             print(f"{command}: {_sentence(error)}", file=sys.stderr)
             sys.exit(_USAGE_ERROR)
@@ -64,7 +68,7 @@ def _register_plugins() -> None:
     register_third_party_plugins()
 
 
-def _parse[Config](config_class: type[Config]) -> Config:
+def _parse[Config](config_class: type[Config], arguments: Arguments) -> Config:
     """The command line as LeRobot parses it.
 
     Raises:
@@ -85,9 +89,17 @@ def _parse[Config](config_class: type[Config]) -> Config:
             raise
         # The parser has printed its usage and an error; draccus hides our own checks' words among the causes.
         last_line = messages.getvalue().strip().split("\n")[-1].split("error: ", 1)[-1]
-        raise own_error(stop) or ConfigError(f"{last_line} (--help_all shows what there is).") from stop
+        raise own_error(stop) or ConfigError(_refused(last_line, config_class, arguments)) from stop
     except (draccus.utils.DraccusException, argparse.ArgumentError) as error:
         raise own_error(error) or ConfigError(_sentence(error)) from error
+
+
+def _refused(words: str, config_class: type, arguments: Arguments) -> str:
+    """The parser's words about an option, in ours where they can be told better."""
+    _, unknown, options = words.partition("unrecognized arguments: ")
+    if unknown:
+        return unknown_option(options.split()[0], config_class, arguments)
+    return bad_choice(words, config_class, arguments) or f"{words} (--help_all shows what there is)."
 
 
 def _quiet() -> None:

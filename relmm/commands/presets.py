@@ -7,7 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from relmm.commands.arguments import Arguments
-from relmm.errors import ConfigError
+from relmm.errors import ConfigError, suggestion
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
 PRESETS = ("paper", "paper_small")
@@ -44,7 +44,8 @@ def resolve_config_path(arguments: Arguments) -> None:
         arguments.set("config_path", preset_path(name))
     elif name is not None and not Path(name).is_file():
         raise ConfigError(
-            f"--config_path={name}: there is no such file; choose one, or a preset: {', '.join(PRESETS)}."
+            f"--config_path={name}: there is no such file{suggestion(name, PRESETS)}; choose one, or a preset: "
+            f"{', '.join(PRESETS)}."
         )
     folder = arguments.get("output_dir")
     if name is None and folder and arguments.is_true("resume"):

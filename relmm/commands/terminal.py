@@ -51,7 +51,7 @@ class _Words:
 def lasting() -> Iterator[None]:
     """Within it, what is printed cannot fail."""
     streams = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = words = _Words(sys.stdout), _Words(sys.stderr)  # type: ignore[assignment]
+    sys.stdout, sys.stderr = words = _Words(sys.stdout), _Words(sys.stderr)
     try:
         yield
     finally:

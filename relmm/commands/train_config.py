@@ -13,7 +13,7 @@ from relmm.commands.cli import dated_folder
 from relmm.commands.policies import check_camera, policy_from_path
 from relmm.commands.upload import LICENSE
 from relmm.episodes import check_repo_id
-from relmm.errors import ConfigError
+from relmm.errors import ConfigError, suggestion
 from relmm.learning.curriculum import CURRICULA
 from relmm.policies.learning import LearningConfig
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
@@ -82,7 +82,8 @@ class CurriculumConfig:
 
     def __post_init__(self) -> None:
         if self.type not in CURRICULA:
-            raise ConfigError(f"curriculum.type is {self.type!r}: choose one of {', '.join(CURRICULA)}.")
+            likely, known = suggestion(self.type, CURRICULA), ", ".join(CURRICULA)
+            raise ConfigError(f"curriculum.type is {self.type!r}{likely}: choose one of {known}.")
 
 
 @dataclass
@@ -133,7 +134,7 @@ class TrainConfig:
 
     robot: RobotConfig | None = None
     dataset: TrainDatasetConfig = field(default_factory=TrainDatasetConfig)
-    policy: PreTrainedConfig | None = None
+    policy: PreTrainedConfig | None = field(default=None, metadata={"choices": LearningConfig})
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
     hub: HubConfig = field(default_factory=HubConfig)

@@ -29,7 +29,6 @@ def test_what_is_true_is_what_the_parser_takes_for_true(value, means):
 @pytest.mark.parametrize("words", [["--help"], ["-h"], ["--robot.type", "-h"], ["--steps", "--help"]])
 def test_help_is_no_value(words):
     assert Arguments(words).asks_for_help
-    assert not Arguments(words).asks_for_all_help
 
 
 def test_an_option_without_value_is_left_to_the_parser():
