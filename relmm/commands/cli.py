@@ -128,11 +128,13 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def progress(total: int, unit: str, title: str | None = None, leave: bool = True, initial: int = 0) -> tqdm[NoReturn]:
+def progress(
+    total: int, unit: str, title: str | None = None, leave: bool = True, layout: str | None = None
+) -> tqdm[NoReturn]:
     """A progress bar; where nobody watches, as in a log file, it says something every ten seconds only."""
     interval = 0.1 if sys.stderr.isatty() else 10.0
     return tqdm(
-        total=total, unit=unit, desc=title, leave=leave, mininterval=interval, dynamic_ncols=True, initial=initial
+        total=total, unit=unit, desc=title, leave=leave, mininterval=interval, dynamic_ncols=True, bar_format=layout
     )
 
 

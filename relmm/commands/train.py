@@ -22,6 +22,7 @@ from relmm.commands.robots import make_locobot
 from relmm.commands.sharing import Uploads, check_uploads, run_arguments
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
+from relmm.commands.training_bar import EVALUATION_WEIGHT, PRACTICE_WEIGHT, Phase, TrainingBar
 from relmm.episodes import (
     Episode,
     EpisodeFollower,
@@ -153,15 +154,21 @@ class Run:
             recorded_runs(DatasetFolder(self.data)),
         )
 
-    def bar(self, title: str) -> Any:
-        """A progress bar of all navigation steps, those before a resume included."""
-        done, steps = self.progress.steps, self.config.steps
-        bar = progress(steps, "step", title, initial=done)
-        if done >= steps:
-            bar.write(f"this run has gone {done} navigation steps already; a --steps above that goes on with it")
-        return bar
+    def bar(self, title: str) -> TrainingBar:
+        """A progress bar of the whole run, what was done before a resume included."""
+        config, done = self.config, self.progress
+        if done.steps >= config.steps:
+            print(f"this run has gone {done.steps} navigation steps already; a --steps above that goes on with it")
+        phases = [Phase("steps", config.steps, 1.0, min(done.steps, config.steps))]
+        if isinstance(config.robot, LocobotSimConfig) and config.env_eval_freq:
+            weight, every = EVALUATION_WEIGHT * config.eval.n_episodes, config.env_eval_freq
+            phases.append(Phase("evaluations", config.steps // every, weight, min(done.steps, config.steps) // every))
+        if config.robot is not None and config.curriculum.type == "stationary":
+            practice = self.policy.config.num_stationary
+            phases.insert(0, Phase("practice", practice, PRACTICE_WEIGHT, min(done.practice_attempts, practice)))
+        return TrainingBar(title, phases)
 
-    def session(self, save: Callable[[], None], evaluate: Callable[[], dict[str, Any]], bar: Any) -> Session:
+    def session(self, save: Callable[[], None], evaluate: Callable[[], dict[str, Any]], bar: TrainingBar) -> Session:
         """The loop with everything around it."""
         config = self.config
         assert config.output_dir is not None
@@ -169,14 +176,9 @@ class Run:
         self.uploads.say = bar.write
 
         def show(status: dict[str, Any]) -> None:
-            if status["steps"] == 0 and status["practice_attempts"] > 0:
-                planned = f"/{self.policy.config.num_stationary}" if config.curriculum.type == "stationary" else ""
-                shown = {"curriculum": f"{status['practice_attempts']}{planned} grasps"}
-            else:
-                shown = {"objects": status["objects"], "grasps": f"{status['successes']}/{status['attempts']}"}
-                shown |= {key: f"{value:.2f}" for key, value in self.learner.logs.items() if key.endswith("_loss")}
-            bar.set_postfix(shown, refresh=False)
-            bar.update(status["steps"] - bar.n)
+            words = f"{status['objects']} objects, {status['successes']}/{status['attempts']} grasps"
+            bar.advance("practice", status["practice_attempts"], words)
+            bar.advance("steps", status["steps"], words)
             self.uploads.check()
 
         metrics = Metrics(config.output_dir / "metrics.jsonl")
@@ -310,13 +312,18 @@ def _person(robot: LocobotRobot, seed: int) -> Callable[[], bool]:
     return lambda: False
 
 
-def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
+def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:
     settings = run.config.robot
     if not isinstance(settings, LocobotSimConfig):
         return dict
     assert run.config.output_dir is not None
+    folder, every = run.config.output_dir / "eval", run.config.env_eval_freq
+
+    def show(share: float) -> None:
+        bar.advance("evaluations", run.progress.steps // every - 1 + share)
+
     evaluation = RoomEvaluation(
-        settings, run.actor, run.config.eval, run.config.output_dir / "eval", should_stop=lambda: run.signals.stopped
+        settings, run.actor, run.config.eval, folder, should_stop=lambda: run.signals.stopped, show=show
     )
 
     def evaluate() -> dict[str, Any]:

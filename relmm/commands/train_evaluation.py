@@ -55,6 +55,7 @@ class RoomEvaluation:
         finally:
             policy.sampling = True
             policy.train()
+        self._show(1.0)  # an episode ends early when all is collected
         shares = [score.collected / score.total for score in scores]
         return {
             "eval_collected": float(np.mean(shares)),
