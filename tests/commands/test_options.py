@@ -6,6 +6,8 @@ import sys
 import pytest
 
 from relmm.commands import evaluate, record, train, upload
+from relmm.commands.policies import make_actor
+from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 
 COMMANDS = {"relmm-train": train, "relmm-eval": evaluate, "relmm-record": record, "relmm-upload": upload}
 
@@ -73,3 +75,9 @@ def test_a_typo_gets_a_suggestion_in_one_sentence(answer, command, word, likely)
     assert f"(did you mean {likely}?)" in words
     assert words.startswith(f"{command}: ")
     assert words.count("\n") == 1
+
+
+def test_a_typo_in_a_setting_of_a_loaded_policy_is_told_as_typed(answer, tmp_path):
+    make_actor(ReLMMConfig(device="cpu")).save_pretrained(tmp_path / "policy")
+    words = answer("relmm-eval", f"--policy.path={tmp_path / 'policy'}", "--policy.num_gras=3")
+    assert words.startswith("relmm-eval: There is no option --policy.num_gras (did you mean --policy.num_grasp?)")
