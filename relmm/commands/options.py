@@ -99,12 +99,12 @@ def listing(config_class: type, arguments: Arguments) -> str:
 
 def unknown_option(word: str, config_class: type, arguments: Arguments) -> str:
     """A sentence about an option that there is not."""
-    name = word.partition("=")[0]
+    name, equals, value = word.partition("=")
     of_policy = f"policy.{name.removeprefix('--')}"
     if arguments.get(of_policy) is not None:  # LeRobot takes the prefix off what comes with --policy.path
         name = f"--{of_policy}"
     known = [f"--{option.name}" for option in options(config_class, arguments)]
-    return f"There is no option {name}{suggestion(name, known)}; --help_all lists what there is."
+    return f"There is no option {name}{equals}{value}{suggestion(name, known)}; --help_all lists what there is."
 
 
 def bad_choice(words: str, config_class: type, arguments: Arguments) -> str | None:

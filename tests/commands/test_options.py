@@ -80,4 +80,4 @@ def test_a_typo_gets_a_suggestion_in_one_sentence(answer, command, word, likely)
 def test_a_typo_in_a_setting_of_a_loaded_policy_is_told_as_typed(answer, tmp_path):
     make_actor(ReLMMConfig(device="cpu")).save_pretrained(tmp_path / "policy")
     words = answer("relmm-eval", f"--policy.path={tmp_path / 'policy'}", "--policy.num_gras=3")
-    assert words.startswith("relmm-eval: There is no option --policy.num_gras (did you mean --policy.num_grasp?)")
+    assert words.startswith("relmm-eval: There is no option --policy.num_gras=3 (did you mean --policy.num_grasp?)")
