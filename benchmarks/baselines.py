@@ -31,8 +31,7 @@ POLICIES: dict[str, type[ControllerConfig]] = {"relmm_random": RelmmRandomConfig
 def evaluate(config: PreTrainedConfig, room: str, seeds: range) -> list[EpisodeScore]:
     """One policy in one room, an episode a seed, as `relmm-eval` does it."""
     actor, env = make_actor(config), RelmmRoomEnv(room=room)
-    episodes = (run_episode(env, actor, seed, f"{config.type} {room} {seed}", video=None) for seed in seeds)
-    scores = [score for score in episodes if score is not None]
+    scores = [run_episode(env, actor, seed, video=None) for seed in seeds]
     env.close()
     return scores
 

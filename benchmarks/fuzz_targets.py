@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from lerobot.configs import parser
 
+from relmm.commands.arguments import Arguments
 from relmm.commands.cli import _parse
 from relmm.commands.curve import draw_learning_curve
 from relmm.commands.evaluate import EvalConfig
@@ -269,13 +270,14 @@ SLOWNESS = {kind: 20 if kind in _SLOW else 1 if kind in _READS_LITTLE else 3 for
 
 def parse(config_class: type, arguments: list[str]) -> Any:
     """As a command takes its arguments."""
-    sys.argv = ["fuzz", *arguments]
+    said = Arguments(arguments)
     # LeRobot's parser keeps the paths of earlier command lines.
     parser._config_path_args.clear()
     parser._config_yaml_overrides.clear()
     if config_class is TrainConfig:
-        resolve_config_path(sys.argv)
-        choose_policy(sys.argv)
-    config: Any = _parse(config_class)
+        resolve_config_path(said)
+        choose_policy(said)
+    said.hand_over()
+    config: Any = _parse(config_class, said)
     assert not isinstance(getattr(config, "policy", None), LearningConfig) or config.policy.fingerprint()
     return config

@@ -103,8 +103,7 @@ def evaluate(folder: Path, room: str, swap: str, seeds: range) -> list[EpisodeSc
     actor, env = make_actor(config), RelmmRoomEnv(room=room)
     for replace in SWAPS[swap]:
         replace(actor.policy, env)
-    episodes = (run_episode(env, actor, seed, f"{room} {swap} {seed}", video=None) for seed in seeds)
-    scores = [score for score in episodes if score is not None]
+    scores = [run_episode(env, actor, seed, video=None) for seed in seeds]
     env.close()
     return scores
 

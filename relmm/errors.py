@@ -1,5 +1,14 @@
 """The exceptions that relmm raises on purpose. The commands print their message and nothing else."""
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """What a mistyped word may have meant, to put behind it in a message; nothing if nothing is like it."""
+    likely = get_close_matches(word, list(known), n=1)
+    return f" (did you mean {likely[0]}?)" if likely else ""
+
 
 class RelmmError(Exception):
     """Base of all of them. The message says what was wrong, what is allowed and what to do next."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from relmm.errors import ConfigError, RobotError
+from relmm.errors import ConfigError, RobotError, suggestion
 from relmm.features import IMAGE_KEY, IMAGE_SIZE, FloatArray
 
 
@@ -175,7 +175,7 @@ def camera_geometry(name: str) -> CameraGeometry:
         ConfigError: there is no such camera.
     """
     if name not in CAMERAS:
-        raise ConfigError(f"Unknown camera {name!r}: choose one of {', '.join(CAMERAS)}.")
+        raise ConfigError(f"Unknown camera {name!r}{suggestion(name, CAMERAS)}: choose one of {', '.join(CAMERAS)}.")
     return CAMERAS[name]
 
 

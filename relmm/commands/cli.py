@@ -17,6 +17,9 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
+from relmm.commands.arguments import Arguments, said
+from relmm.commands.options import bad_choice, listing, unknown_option
+from relmm.commands.terminal import lasting
 from relmm.errors import ConfigError, RelmmError
 
 _USAGE_ERROR = 2
@@ -26,7 +29,7 @@ def run[Config](
     command: str,
     config_class: type[Config],
     job: Callable[[Config], None],
-    prepare: Callable[[list[str]], None] = lambda arguments: None,
+    prepare: Callable[[Arguments], None] = lambda arguments: None,
 ) -> None:
     """Parse the command line into a config, do the job, and end with a sentence instead of a traceback.
 
@@ -36,39 +39,23 @@ def run[Config](
         job: what to do.
         prepare: may change the arguments before they are parsed.
     """
-    _quiet()
-    sys.stdout, sys.stderr = _Terminal(sys.stdout), _Terminal(sys.stderr)
-    try:
-        _register_plugins()
-        prepare(sys.argv)
-        job(_parse(config_class))
-    except (RelmmError, OSError, MemoryError) as error:
-        print(f"{command}: {_sentence(error)}", file=sys.stderr)
-        sys.exit(_USAGE_ERROR)
-    except KeyboardInterrupt:
-        print(f"{command}: interrupted.", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
-
-
-class _Terminal:
-    """A stream that takes what is written to it also when nobody is there to read it any more."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        """See `io.TextIOBase.write`."""
-        with contextlib.suppress(OSError):
-            self._stream.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        """See `io.TextIOBase.flush`."""
-        with contextlib.suppress(OSError):
-            self._stream.flush()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
+    with lasting():
+        _quiet()
+        try:
+            _register_plugins()
+            arguments = said()
+            if arguments.asks_for_any_help:
+                print(listing(config_class, arguments))
+                return
+            prepare(arguments)
+            arguments.hand_over()
+            job(_parse(config_class, arguments))
+        except (RelmmError, OSError, MemoryError) as error:
+            print(f"{command}: {_sentence(error)}", file=sys.stderr)
+            sys.exit(_USAGE_ERROR)
+        except KeyboardInterrupt:
+            print(f"{command}: interrupted.", file=sys.stderr)
+            sys.exit(128 + signal.SIGINT)
 
 
 def _register_plugins() -> None:
@@ -79,7 +66,7 @@ def _register_plugins() -> None:
     register_third_party_plugins()
 
 
-def _parse[Config](config_class: type[Config]) -> Config:
+def _parse[Config](config_class: type[Config], arguments: Arguments) -> Config:
     """The command line as LeRobot parses it.
 
     Raises:
@@ -100,9 +87,17 @@ def _parse[Config](config_class: type[Config]) -> Config:
             raise
         # The parser has printed its usage and an error; draccus hides our own checks' words among the causes.
         last_line = messages.getvalue().strip().split("\n")[-1].split("error: ", 1)[-1]
-        raise own_error(stop) or ConfigError(f"{last_line} (--help_all shows what there is).") from stop
+        raise own_error(stop) or ConfigError(_refused(last_line, config_class, arguments)) from stop
     except Exception as error:  # whatever the parser meets, somebody has typed it, or has a file with it
         raise own_error(error) or ConfigError(_sentence(error)) from error
+
+
+def _refused(words: str, config_class: type, arguments: Arguments) -> str:
+    """The parser's words about an option, in ours where they can be told better."""
+    _, unknown, options = words.partition("unrecognized arguments: ")
+    if unknown:
+        return unknown_option(options.split()[0], config_class, arguments)
+    return bad_choice(words, config_class, arguments) or f"{words} (--help_all shows what there is)."
 
 
 def _quiet() -> None:
@@ -131,38 +126,54 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def progress(total: int, unit: str, title: str | None = None, leave: bool = True, initial: int = 0) -> tqdm[NoReturn]:
+def progress(
+    total: int, unit: str, title: str | None = None, leave: bool = True, layout: str | None = None
+) -> tqdm[NoReturn]:
     """A progress bar; where nobody watches, as in a log file, it says something every ten seconds only."""
     interval = 0.1 if sys.stderr.isatty() else 10.0
     return tqdm(
-        total=total, unit=unit, desc=title, leave=leave, mininterval=interval, dynamic_ncols=True, initial=initial
+        total=total, unit=unit, desc=title, leave=leave, mininterval=interval, dynamic_ncols=True, bar_format=layout
     )
 
 
 class StopOnSignal:
-    """Notes the first SIGINT, SIGTERM or SIGHUP instead of dying of it; a second one ends the process as usual."""
+    """Notes the first SIGINT, SIGTERM or SIGHUP instead of dying of it; a second one ends the process as usual.
+
+    Not a second SIGHUP: when a terminal goes away, the kernel and the shell both send one.
+
+    Attributes:
+        number: of the signal, None before there is one.
+    """
 
     def __init__(self) -> None:
-        self.stopped = False
+        self.number: int | None = None
         self._previous: dict[int, Any] = {}
+
+    @property
+    def stopped(self) -> bool:
+        """Whether to stop."""
+        return self.number is not None
 
     def __enter__(self) -> StopOnSignal:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            self._previous[number] = signal.signal(number, self._note)
+            if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+                self._previous[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._restore()
+        self._restore(*self._previous)
 
     def _note(self, number: int, frame: types.FrameType | None) -> None:
-        self.stopped = True
-        self._restore()
+        if self.stopped:
+            return
+        self.number = number
+        self._restore(signal.SIGINT, signal.SIGTERM)
         print("\nStopping: saving what there is (once more to stop at once).", file=sys.stderr)
 
-    def _restore(self) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        self._previous.clear()
+    def _restore(self, *numbers: int) -> None:
+        for number in numbers:
+            if number in self._previous:
+                signal.signal(number, self._previous.pop(number))
 
 
 def dated_folder(kind: str, name: str) -> Path:

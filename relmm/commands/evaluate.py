@@ -7,7 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,9 @@ import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+from numpy.typing import NDArray
 
+from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, dated_folder, progress, run
 from relmm.commands.policies import check_camera, make_actor, policy_from_path, take_seed
 from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
@@ -120,8 +122,12 @@ class EpisodeScore:
         return [self.collected / self.total, self.picked_up, self.grasps, share, *rates, self.metres]
 
 
+class EpisodeStopped(Exception):
+    """An episode was stopped before its end, so that it has no score."""
+
+
 def evaluate(config: EvalConfig) -> None:
-    """Run the episodes, and write `eval_info.json` after each; then print a table. A signal ends it between steps."""
+    """Run the episodes; `eval_info.json` holds those that have ended, whenever and however the command does."""
     assert isinstance(config.env, RelmmRoomEnvConfig)
     assert config.policy is not None
     assert config.output_dir is not None
@@ -130,48 +136,66 @@ def evaluate(config: EvalConfig) -> None:
     actor = make_actor(config.policy)
     env = RelmmRoomEnv(**{**config.env.gym_kwargs, "render_mode": None})
     scores: list[EpisodeScore] = []
-    with StopOnSignal() as signals, closing(env):
-        for index in range(config.eval.n_episodes):
-            filmed = index < config.eval.n_videos
-            video = config.output_dir / "videos" / f"eval_episode_{index}.mp4" if filmed else None
-            title = f"episode {index + 1}/{config.eval.n_episodes}"
-            score = run_episode(env, actor, config.seed + index, title, video, lambda: signals.stopped)
-            if score is None:
-                break
-            scores.append(score)
-            _write(config.output_dir, scores)
-    if scores:
-        _show(config.output_dir, scores)
-    else:
-        print("no episode was finished")
+    with StopOnSignal() as signals, closing(env), _bar(config) as bar:
+
+        def show(info: dict[str, Any]) -> None:
+            bar.set_description(f"episode {len(scores) + 1}/{config.eval.n_episodes}", refresh=False)
+            bar.set_postfix(collected=info["objects_collected"], grasps=info["grasp_attempts"], refresh=False)
+            bar.update(len(scores) * env.navigation_steps + info["navigation_steps"] - bar.n)
+
+        with suppress(EpisodeStopped):
+            for index in range(config.eval.n_episodes):
+                filmed = index < config.eval.n_videos
+                video = config.output_dir / "videos" / f"eval_episode_{index}.mp4" if filmed else None
+                scores.append(run_episode(env, actor, config.seed + index, video, lambda: signals.stopped, show))
+                _write(config.output_dir, scores)
+    _say(config, scores)
+    if signals.number is not None:
+        sys.exit(128 + signals.number)
+
+
+def _bar(config: EvalConfig) -> Any:
+    assert isinstance(config.env, RelmmRoomEnvConfig)
+    return progress(config.eval.n_episodes * config.env.navigation_steps, "step", leave=False)
 
 
 def run_episode(
     env: RelmmRoomEnv,
     actor: Actor,
     seed: int,
-    title: str,
     video: Path | None,
     should_stop: Callable[[], bool] = lambda: False,
-) -> EpisodeScore | None:
-    """One episode with a progress bar, and a film of it at four times its speed; None if it was stopped."""
+    show: Callable[[dict[str, Any]], None] = lambda info: None,
+) -> EpisodeScore:
+    """One episode, filmed at four times its speed.
+
+    Args:
+        env: the room.
+        actor: who acts.
+        seed: where the objects lie.
+        video: the film; None for none.
+        should_stop: asked before each step.
+        show: takes the room's `info` after each step.
+
+    Raises:
+        EpisodeStopped: it was told to stop; the film shows what there was.
+    """
     observation, info = env.reset(seed=seed)
     actor.reset()
     film = Film(env.robot.body, video) if video is not None else None
-    with progress(env.navigation_steps, "step", title, leave=False) as bar, film or nullcontext():
-        ended = False
-        while not ended:
-            if should_stop():
-                return None
+    ended = False
+    with film or nullcontext():
+        while not ended and not should_stop():
             action = actor.act(_robot_observation(observation))
             if film is not None:
                 film.caption, film.inset = _caption(info, actor.describe(action)), actor.picture()
             observation, _, terminated, truncated, info = env.step(np.array([action[n] for n in ACTION_NAMES]))
             ended = terminated or truncated
-            bar.set_postfix(collected=info["objects_collected"], grasps=info["grasp_attempts"], refresh=False)
-            bar.update(info["navigation_steps"] - bar.n)
+            show(info)
         if film is not None:
-            film.caption = _caption(info, "the end")
+            film.caption = _caption(info, "the end" if ended else "stopped here")
+    if not ended:
+        raise EpisodeStopped
     return EpisodeScore(
         seed=seed,
         collected=info["objects_collected"],
@@ -208,31 +232,44 @@ def table(scores: list[EpisodeScore]) -> str:
     return "\n".join(lines)
 
 
+def _shares(scores: list[EpisodeScore]) -> NDArray[np.float64]:
+    return np.array([score.collected / score.total for score in scores])
+
+
 def _write(folder: Path, scores: list[EpisodeScore]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    share = np.array([score.collected / score.total for score in scores])
+    """Replace the results as a whole: whoever reads them meanwhile, or after a crash, finds the last ones."""
+    share = _shares(scores)
     overall = {"mean_share_collected": share.mean(), "std_share_collected": share.std(), "n_episodes": len(scores)}
     overall["pc_success"] = 100 * float(np.mean(share >= SUCCESS_SHARE))
     overall["avg_sum_reward"] = float(np.mean([score.collected for score in scores]))
     info = {"overall": overall, "per_episode": [asdict(score) for score in scores]}
-    temporary = folder / ".eval_info.json"
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / ".eval_info.json.tmp"
     temporary.write_text(json.dumps(info, indent=2))
     os.replace(temporary, folder / "eval_info.json")
 
 
-def _show(folder: Path, scores: list[EpisodeScore]) -> None:
-    share = np.array([score.collected / score.total for score in scores])
-    print(table(scores))
-    print(f"\ncollected {share.mean():.1%} of the objects (std {share.std():.1%}); details in {folder}")
+def _say(config: EvalConfig, scores: list[EpisodeScore]) -> None:
+    folder, share = config.output_dir, _shares(scores)
+    assert folder is not None
+    if len(scores) < config.eval.n_episodes:
+        print(f"stopped after {len(scores)} of {config.eval.n_episodes} episodes")
+    if scores:
+        print(table(scores))
+        print(f"\ncollected {share.mean():.1%} of the objects (std {share.std():.1%}); details in {folder}")
     for video in sorted(folder.glob("videos/*.mp4")):
         print(f"video: {video}")
 
 
 def main() -> None:
-    """Entry point of `relmm-eval`; there is only one environment, so its type need not be said."""
-    if not any(argument.startswith(("--env.type", "--config_path")) for argument in sys.argv):
-        sys.argv.append("--env.type=relmm_room")
-    run("relmm-eval", EvalConfig, evaluate)
+    """Entry point of `relmm-eval`."""
+    run("relmm-eval", EvalConfig, evaluate, prepare=_prepare)
+
+
+def _prepare(arguments: Arguments) -> None:
+    """There is only one environment, so its type need not be said."""
+    if arguments.get("env.type") is None and arguments.get("config_path") is None:
+        arguments.set("env.type", "relmm_room")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import shutil
 from fnmatch import fnmatch
 from pathlib import Path
 
+from relmm.commands.arguments import Arguments
 from relmm.episodes import check_trainable, verify_and_repair
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, RELMM, STATS, TASKS
 from relmm.episodes.hub import download_dataset
@@ -17,11 +18,10 @@ from relmm.learning.hub import METRICS, POLICY_FILES, Source, fetch_checkpoint, 
 from relmm.learning.settings import SETTINGS, portable_settings
 from relmm.learning.untrusted import read_json
 
-_PATH, _OUTPUT = "--policy.path=", "--output_dir="
 _DATASET_FILES = (INFO, STATS, TASKS, RELMM, EPISODE_FILES, DATA_FILES)
 
 
-def take_over_from_hub(arguments: list[str]) -> None:
+def take_over_from_hub(arguments: Arguments) -> None:
     """With `--resume=true --policy.path=user/repo[@revision]`, make that run in `--output_dir`.
 
     Args:
@@ -31,12 +31,12 @@ def take_over_from_hub(arguments: list[str]) -> None:
         ConfigError: there is no such checkpoint, training cannot go on from it, or the folder exists.
         DatasetError: its dataset cannot be had, or is damaged.
     """
-    path = next((a.removeprefix(_PATH) for a in arguments if a.startswith(_PATH)), None)
-    if "--resume=true" not in arguments or path is None:
+    path, folder = arguments.get("policy.path"), arguments.get("output_dir")
+    if path is None or not arguments.is_true("resume"):
         return
-    output = next((Path(a.removeprefix(_OUTPUT)) for a in arguments if a.startswith(_OUTPUT)), None)
-    if output is None:
+    if not folder:
         raise ConfigError(f"Say where to go on with {path}: --output_dir=FOLDER, which does not exist yet.")
+    output = Path(folder)
     if output.exists():
         raise ConfigError(
             f"{output} exists already: go on with the run in it without --policy.path, or choose another --output_dir."
@@ -46,7 +46,7 @@ def take_over_from_hub(arguments: list[str]) -> None:
             f"{path} is a folder: go on with a run of this machine with --resume=true --output_dir=FOLDER_OF_THE_RUN."
         )
     _make_run(*split_revision(path), output)
-    arguments.remove(f"{_PATH}{path}")
+    arguments.remove("policy.path")
 
 
 def _make_run(repo_id: str, revision: str, output: Path) -> None:

@@ -9,6 +9,7 @@ import draccus
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 
+from relmm.commands.arguments import said
 from relmm.commands.cli import own_error
 from relmm.errors import ConfigError
 from relmm.features import dataset_features
@@ -24,7 +25,7 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
     Raises:
         ConfigError: neither was given, or there is no policy at the path.
     """
-    _check_device(parser.parse_arg("policy.device"))
+    _check_device(said().get("policy.device"))
     path = parser.get_path_arg("policy")
     if path:
         overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
@@ -49,7 +50,7 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
 def _forget_owner(policy: PreTrainedConfig, overrides: list[str]) -> None:
     """Where a policy was uploaded to is not where this run uploads to."""
     for name, value in (("push_to_hub", False), ("repo_id", None), ("private", None)):
-        if not any(override.startswith(f"--{name}") for override in overrides):
+        if not any(override.startswith(f"--{name}=") for override in overrides):
             setattr(policy, name, value)
 
 

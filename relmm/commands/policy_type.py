@@ -8,13 +8,12 @@ from typing import Any
 from draccus.cfgparsing import load_config
 from draccus.utils import ParsingError
 
+from relmm.commands.arguments import Arguments
 from relmm.errors import ConfigError
 from relmm.learning.untrusted import refuse_first_version
 
-_TYPE, _PATH, _FILE = "--policy.type=", "--policy.path=", "--config_path="
 
-
-def choose_policy(arguments: list[str]) -> None:
+def choose_policy(arguments: Arguments) -> None:
     """Take `--policy.type=relmm` where nothing else names a policy.
 
     Args:
@@ -23,18 +22,16 @@ def choose_policy(arguments: list[str]) -> None:
     Raises:
         ConfigError: the file of settings is of another policy than the command line says, or of relmm 0.1.0.
     """
-    said, path, file = (
-        next((argument.removeprefix(option) for argument in arguments if argument.startswith(option)), None)
-        for option in (_TYPE, _PATH, _FILE)
-    )
+    said, path, file = (arguments.get(name) for name in ("policy.type", "policy.path", "config_path"))
     stored = {} if file is None else _stored_policy(Path(file))
     refuse_first_version(stored, Path(file or ""))
     if said is not None and stored.get("type", said) != said:
         raise ConfigError(
-            f"{_TYPE}{said} and {_FILE}{file}, which is of policy {stored['type']!r}: leave one of them out."
+            f"--policy.type={said} and --config_path={file}, which is of policy {stored['type']!r}: leave one of "
+            "them out."
         )
     if said is None and path is None and not {"type", "path"} & stored.keys():
-        arguments.append(f"{_TYPE}relmm")
+        arguments.set("policy.type", "relmm")
 
 
 def _stored_policy(file: Path) -> dict[str, Any]:

@@ -6,11 +6,11 @@ import json
 from importlib.resources import files
 from pathlib import Path
 
-from relmm.errors import ConfigError
+from relmm.commands.arguments import Arguments
+from relmm.errors import ConfigError, suggestion
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
 PRESETS = ("paper", "paper_small")
-_OPTION = "--config_path="
 
 
 def preset_path(name: str) -> Path:
@@ -25,7 +25,7 @@ def load_preset(name: str) -> RelmmPaperConfig:
     return RelmmPaperConfig(**settings)
 
 
-def resolve_config_path(arguments: list[str]) -> None:
+def resolve_config_path(arguments: Arguments) -> None:
     """Replace a preset's name after `--config_path=` by its file; a resumed run takes the settings of its checkpoint.
 
     Args:
@@ -34,20 +34,21 @@ def resolve_config_path(arguments: list[str]) -> None:
     Raises:
         ConfigError: no such file, or a preset and a checkpoint, which has its own settings.
     """
-    for index, argument in enumerate(arguments):
-        name = argument.removeprefix(_OPTION)
-        if name in PRESETS and argument.startswith(_OPTION):
-            checkpoint = next((a for a in arguments if a.startswith("--policy.path=")), None)
-            if checkpoint is not None:
-                raise ConfigError(
-                    f"{argument} begins a new policy and {checkpoint} goes on with another, by its own settings: leave "
-                    "one of them out."
-                )
-            arguments[index] = f"{_OPTION}{preset_path(name)}"
-        elif argument.startswith(_OPTION) and not Path(name).is_file():
-            raise ConfigError(f"{argument}: there is no such file; choose one, or a preset: {', '.join(PRESETS)}.")
-    folder = next((a.partition("=")[2] for a in arguments if a.startswith("--output_dir=")), None)
-    if "--resume=true" in arguments and folder and not any(a.startswith(_OPTION) for a in arguments):
+    name, checkpoint = arguments.get("config_path"), arguments.get("policy.path")
+    if name in PRESETS:
+        if checkpoint is not None:
+            raise ConfigError(
+                f"--config_path={name} begins a new policy and --policy.path={checkpoint} goes on with another, by its "
+                "own settings: leave one of them out."
+            )
+        arguments.set("config_path", preset_path(name))
+    elif name is not None and not Path(name).is_file():
+        raise ConfigError(
+            f"--config_path={name}: there is no such file{suggestion(name, PRESETS)}; choose one, or a preset: "
+            f"{', '.join(PRESETS)}."
+        )
+    folder = arguments.get("output_dir")
+    if name is None and folder and arguments.is_true("resume"):
         stored = Path(folder) / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
         if stored.is_file():
-            arguments.append(f"{_OPTION}{stored}")
+            arguments.set("config_path", stored)

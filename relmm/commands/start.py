@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
+
+from relmm.commands.arguments import said
+from relmm.commands.terminal import say_loading
 
 SHORT_HELP = {
     "relmm-train": """\
@@ -105,8 +107,8 @@ def upload() -> None:
 
 
 def _start(command: str, module: str) -> None:
-    if {"-h", "--help"} & set(sys.argv[1:]):
+    if said().asks_for_help:
         print(f"{SHORT_HELP[command]}\n{command} --help_all lists every option.")
         return
-    sys.argv = ["--help" if argument == "--help_all" else argument for argument in sys.argv]
+    say_loading(command)
     import_module(f"relmm.commands.{module}").main()

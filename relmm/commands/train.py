@@ -8,206 +8,38 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
 
-from relmm.commands.cli import StopOnSignal, now, progress, run
+from relmm.commands.arguments import Arguments
+from relmm.commands.cli import StopOnSignal, now, run
 from relmm.commands.curve import draw_learning_curve
 from relmm.commands.hub_resume import take_over_from_hub
-from relmm.commands.policies import make_actor
 from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
 from relmm.commands.robots import make_locobot
-from relmm.commands.sharing import Uploads, check_uploads, run_arguments
+from relmm.commands.sharing import check_uploads
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
+from relmm.commands.training_bar import TrainingBar
+from relmm.commands.training_run import Run
 from relmm.episodes import (
     Episode,
     EpisodeFollower,
     EpisodeRecorder,
     check_new,
-    check_trainable,
-    local_root,
-    read_episodes,
     saved_episodes,
     summarize,
     verify_and_repair,
 )
-from relmm.episodes.folder import DatasetFolder
-from relmm.episodes.info import runs_of
-from relmm.episodes.upload import recorded_runs
-from relmm.errors import ConfigError
-from relmm.learning.checkpoint import (
-    check_same_networks,
-    last_checkpoint,
-    load_training_state,
-    pretrained_model,
-    read_training_state,
-    save_checkpoint,
-)
 from relmm.learning.life import Life
-from relmm.learning.progress import Metrics, Progress
-from relmm.learning.session import Schedule, Session
 from relmm.learning.trainer import Trainer
-from relmm.policies.learning import LearningConfig, LearningPolicy
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.locobot_sim import LocobotSim
 from relmm.sim.person import Person
 
-_TRAINER_STREAM, _PERSON_STREAM = 3, 4  # keep random numbers of one seed apart
+_PERSON_STREAM = 4  # keeps random numbers of one seed apart
 _POLL_S = 0.5  # between looks at a dataset that is followed
-
-
-class Run:
-    """One run of relmm-train: what is made from its settings, and restored when it is resumed.
-
-    Args:
-        config: its settings.
-        signals: tell when to stop.
-    """
-
-    def __init__(self, config: TrainConfig, signals: StopOnSignal) -> None:
-        assert isinstance(config.policy, LearningConfig)
-        self.config, self.signals = config, signals
-        self.saved_config = _settings_to_keep(config)
-        self.checkpoint = last_checkpoint(config.checkpoints) if config.resume else None
-        if self.checkpoint is not None:
-            check_same_networks(self.checkpoint, config.policy.fingerprint())
-            config.policy.pretrained_path = pretrained_model(self.checkpoint)
-        self.actor = make_actor(config.policy)
-        config.policy.pretrained_path = None  # a checkpoint stands for itself, wherever it is copied to
-        policy = self.actor.policy
-        assert isinstance(policy, LearningPolicy)
-        self.policy = policy
-        policy.train()
-        self.learner = policy.make_learner(config.seed, config.replay_frames)
-        self.rng = np.random.default_rng([config.seed, _TRAINER_STREAM])
-        self.progress = Progress()
-        self.learned = 0  # episodes of the run's dataset that the checkpoint has learned from
-        if self.checkpoint is not None:
-            counters = load_training_state(self.checkpoint, self.learner, self.rng)
-            self.learned, self.progress.interventions = counters["episodes"], counters.get("interventions", 0)
-        assert config.output_dir is not None
-        self.uploads = Uploads(run_arguments(config), config.output_dir)
-
-    @property
-    def data(self) -> Path:
-        """The folder of the dataset that the run learns from."""
-        return self.config.dataset.follow or self.config.dataset_root
-
-    def check_cursor(self, episodes: int) -> None:
-        """Refuse to go on without the data that the checkpoint has learned from.
-
-        Args:
-            episodes: that the run's dataset has.
-
-        Raises:
-            ConfigError: it has fewer, or those of another run.
-        """
-        if self.checkpoint is None:
-            return
-        what = f"the checkpoint {self.checkpoint} has learned from {self.learned} episodes"
-        advice = f"bring them back, or begin a new run with --policy.path={pretrained_model(self.checkpoint)}"
-        if episodes < self.learned:
-            raise ConfigError(f"{what}, and its dataset {self.data} has {episodes}: {advice}.")
-        runs = runs_of(read_training_state(self.checkpoint))
-        if self.learned and recorded_runs(DatasetFolder(self.data))[: len(runs)] != runs:
-            raise ConfigError(f"{what} of another recording than {self.data}: {advice}.")
-
-    def read_initial_data(self) -> None:
-        """Fill the replay with the dataset to start from, and learn what is new in it."""
-        if self.config.dataset.init is not None:
-            root = local_root(self.config.dataset.init)
-            check_trainable(root, self.policy.config.camera)
-            update = self.checkpoint is None
-            for episode in _with_bar(root, "reading the initial dataset"):
-                self.learner.read(episode, update)
-
-    def read_own_data(self) -> int:
-        """Fill the replay with the run's own dataset, and learn what the checkpoint has not; how many episodes."""
-        episodes = 0
-        if self.checkpoint is not None and self.data.exists():
-            check_trainable(self.data, self.policy.config.camera)
-            for episode in _with_bar(self.data, "reading the run's own dataset"):
-                self.learner.read(episode, update=episode.index >= self.learned)
-                self.progress.read(episode)
-                episodes = episode.index + 1
-        return episodes
-
-    def save(self, episodes: int) -> None:
-        """Write a checkpoint.
-
-        Args:
-            episodes: of the run's dataset that the weights have learned from; a resumed run learns the later ones.
-        """
-        counters = {"episodes": episodes, "interventions": self.progress.interventions}
-        save_checkpoint(
-            self.config.checkpoints,
-            self.progress.steps,
-            self.actor,
-            self.learner,
-            self.rng,
-            counters,
-            self.saved_config,
-            recorded_runs(DatasetFolder(self.data)),
-        )
-
-    def bar(self, title: str) -> Any:
-        """A progress bar of all navigation steps, those before a resume included."""
-        done, steps = self.progress.steps, self.config.steps
-        bar = progress(steps, "step", title, initial=done)
-        if done >= steps:
-            bar.write(f"this run has gone {done} navigation steps already; a --steps above that goes on with it")
-        return bar
-
-    def session(self, save: Callable[[], None], evaluate: Callable[[], dict[str, Any]], bar: Any) -> Session:
-        """The loop with everything around it."""
-        config = self.config
-        assert config.output_dir is not None
-        schedule = Schedule(config.steps, config.log_freq, config.save_freq, config.env_eval_freq, config.hub.every)
-        self.uploads.say = bar.write
-
-        def show(status: dict[str, Any]) -> None:
-            if status["steps"] == 0 and status["practice_attempts"] > 0:
-                planned = f"/{self.policy.config.num_stationary}" if config.curriculum.type == "stationary" else ""
-                shown = {"curriculum": f"{status['practice_attempts']}{planned} grasps"}
-            else:
-                shown = {"objects": status["objects"], "grasps": f"{status['successes']}/{status['attempts']}"}
-                shown |= {key: f"{value:.2f}" for key, value in self.learner.logs.items() if key.endswith("_loss")}
-            bar.set_postfix(shown, refresh=False)
-            bar.update(status["steps"] - bar.n)
-            self.uploads.check()
-
-        metrics = Metrics(config.output_dir / "metrics.jsonl")
-        return Session(
-            schedule,
-            self.progress,
-            self.learner,
-            metrics,
-            save=save,
-            evaluate=evaluate,
-            show=show,
-            upload=self.uploads.begin,
-        )
-
-
-def _settings_to_keep(config: TrainConfig) -> dict[str, Any]:
-    """For a resume, which may come from another folder: as given, but with whole paths."""
-    settings: dict[str, Any] = draccus.encode(config)
-    dataset = settings["dataset"]
-    for name in ("root", "follow", "init"):
-        # What does not exist yet is a folder, too, but for `init`: that may be a name on the Hub.
-        if dataset[name] is not None and (name != "init" or Path(dataset[name]).exists()):
-            dataset[name] = str(Path(dataset[name]).absolute())
-    return settings
-
-
-def _with_bar(root: Path, title: str) -> Iterator[Episode]:
-    with progress(saved_episodes(root), "episode", title, leave=False) as bar:
-        for episode in read_episodes(root):
-            yield episode
-            bar.update()
 
 
 def train(config: TrainConfig) -> None:
@@ -310,13 +142,19 @@ def _person(robot: LocobotRobot, seed: int) -> Callable[[], bool]:
     return lambda: False
 
 
-def _evaluation(run: Run, bar: Any) -> Callable[[], dict[str, Any]]:
+def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:
     settings = run.config.robot
     if not isinstance(settings, LocobotSimConfig):
         return dict
     assert run.config.output_dir is not None
-    videos = run.config.output_dir / "eval"
-    evaluation = RoomEvaluation(settings, run.actor, run.config.eval, videos, lambda: run.signals.stopped)
+    folder, every = run.config.output_dir / "eval", run.config.env_eval_freq
+
+    def show(share: float) -> None:
+        bar.advance("evaluations", run.progress.steps // every - 1 + share)
+
+    evaluation = RoomEvaluation(
+        settings, run.actor, run.config.eval, folder, should_stop=lambda: run.signals.stopped, show=show
+    )
 
     def evaluate() -> dict[str, Any]:
         scores = evaluation(run.progress.steps)
@@ -353,7 +191,7 @@ def main() -> None:
     run("relmm-train", TrainConfig, train, prepare=_prepare)
 
 
-def _prepare(arguments: list[str]) -> None:
+def _prepare(arguments: Arguments) -> None:
     take_over_from_hub(arguments)
     resolve_config_path(arguments)
     choose_policy(arguments)

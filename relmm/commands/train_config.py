@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
+from relmm.commands.arguments import said
 from relmm.commands.cli import dated_folder
 from relmm.commands.policies import check_camera, policy_from_path
 from relmm.commands.upload import LICENSE
 from relmm.episodes import MAX_STEPS, check_repo_id
-from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
+from relmm.errors import MANY, MAX_SEED, ConfigError, check_range, suggestion
 from relmm.learning.curriculum import CURRICULA
 from relmm.policies.learning import LearningConfig
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
@@ -81,7 +81,8 @@ class CurriculumConfig:
 
     def __post_init__(self) -> None:
         if self.type not in CURRICULA:
-            raise ConfigError(f"curriculum.type is {self.type!r}: choose one of {', '.join(CURRICULA)}.")
+            likely, known = suggestion(self.type, CURRICULA), ", ".join(CURRICULA)
+            raise ConfigError(f"curriculum.type is {self.type!r}{likely}: choose one of {known}.")
 
 
 @dataclass
@@ -131,7 +132,7 @@ class TrainConfig:
 
     robot: RobotConfig | None = None
     dataset: TrainDatasetConfig = field(default_factory=TrainDatasetConfig)
-    policy: PreTrainedConfig | None = None
+    policy: PreTrainedConfig | None = field(default=None, metadata={"choices": LearningConfig})
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
     hub: HubConfig = field(default_factory=HubConfig)
@@ -177,7 +178,7 @@ class TrainConfig:
         policy = self.policy
         assert policy is not None
         if policy.push_to_hub and policy.repo_id is None:
-            if parser.parse_arg("policy.push_to_hub") is not None:
+            if said().get("policy.push_to_hub") is not None:
                 raise ConfigError(
                     "Say where to upload the policy: --policy.push_to_hub=true --policy.repo_id=user/name."
                 )

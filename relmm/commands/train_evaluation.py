@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from relmm.commands.evaluate import EpisodeScore, run_episode
+from relmm.commands.evaluate import EpisodeScore, EpisodeStopped, run_episode
 from relmm.commands.train_config import TrainEvalConfig
 from relmm.learning.actor import Actor
 from relmm.policies.learning import LearningPolicy
@@ -24,7 +24,8 @@ class RoomEvaluation:
         actor: the policy that is being trained, with its processors.
         config: how many episodes, of which seeds.
         videos: where to put them.
-        should_stop: asked between steps.
+        should_stop: asked before each step.
+        show: takes the share of the evaluation that is done, after each step.
     """
 
     def __init__(
@@ -33,9 +34,12 @@ class RoomEvaluation:
         actor: Actor,
         config: TrainEvalConfig,
         videos: Path,
+        *,
         should_stop: Callable[[], bool],
+        show: Callable[[float], None] = lambda done: None,
     ) -> None:
-        self._actor, self._config, self._videos, self._should_stop = actor, config, videos, should_stop
+        self._actor, self._config, self._videos = actor, config, videos
+        self._should_stop, self._show = should_stop, show
         self._env = RelmmRoomEnv(room=robot.room, num_objects=robot.num_objects, camera=robot.camera)
 
     def __call__(self, step: int) -> dict[str, Any]:
@@ -45,15 +49,13 @@ class RoomEvaluation:
         policy.sampling = False
         policy.eval()
         try:
-            scores = []
-            for index in range(self._config.n_episodes):
-                score = self._episode(step, index)
-                if score is None:
-                    return {}
-                scores.append(score)
+            scores = [self._episode(step, index) for index in range(self._config.n_episodes)]
+        except EpisodeStopped:
+            return {}
         finally:
             policy.sampling = True
             policy.train()
+        self._show(1.0)  # an episode ends early when all is collected
         shares = [score.collected / score.total for score in scores]
         return {
             "eval_collected": float(np.mean(shares)),
@@ -62,8 +64,12 @@ class RoomEvaluation:
             "eval_grasp_success": sum(s.picked_up for s in scores) / max(sum(s.grasps for s in scores), 1),
         }
 
-    def _episode(self, step: int, index: int) -> EpisodeScore | None:
+    def _episode(self, step: int, index: int) -> EpisodeScore:
         filmed = index < self._config.n_videos
         video = self._videos / f"videos_step_{step:06d}" / f"eval_episode_{index}.mp4" if filmed else None
-        title = f"evaluation {index + 1}/{self._config.n_episodes}"
-        return run_episode(self._env, self._actor, self._config.seed + index, title, video, self._should_stop)
+
+        def show(info: dict[str, Any]) -> None:
+            episodes = index + info["navigation_steps"] / self._env.navigation_steps
+            self._show(episodes / self._config.n_episodes)
+
+        return run_episode(self._env, self._actor, self._config.seed + index, video, self._should_stop, show)

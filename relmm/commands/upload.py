@@ -159,7 +159,9 @@ def _url(path: str) -> str:
 
 def main() -> None:
     """Entry point of `relmm-upload`."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the copy that is uploaded is removed
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+            signal.signal(number, lambda *_: sys.exit(1))  # so that the copy that is uploaded is removed
     run("relmm-upload", UploadConfig, upload)
 
 

@@ -26,7 +26,7 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from relmm.errors import ConfigError
+from relmm.errors import ConfigError, suggestion
 from relmm.features import FloatArray
 from relmm.sim.furniture import Obstacle, Rug, check_positive, require
 from relmm.sim.objects import Color, add_object, check_object
@@ -247,8 +247,8 @@ def make_room(name: str, **overrides: Any) -> Room:
     Raises:
         ConfigError: unknown room or field, or a value that cannot work.
     """
-    if name not in _ROOMS:
-        require(name in room_names(), f"There is no room {name!r}; choose one of {', '.join(sorted(_ROOMS))}.")
+    if name not in _ROOMS and name not in (names := room_names()):
+        raise ConfigError(f"There is no room {name!r}{suggestion(name, names)}; choose one of {', '.join(names)}.")
     room = _ROOMS[name]
     known = [field.name for field in fields(room)]
     unknown = [key for key in overrides if key not in known]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from relmm.commands import record, train, upload
+from relmm.commands.arguments import Arguments
 from relmm.commands.hub_resume import take_over_from_hub
 from relmm.commands.policies import make_actor
 from relmm.commands.sharing import Uploads, dataset_arguments
@@ -203,10 +204,10 @@ def test_a_disk_that_is_full_while_a_run_is_taken_over(hub, call, tmp_path):
     assert status == 2
     assert "make room on the disk and try again" in errors.splitlines()[-1]
     assert not out.exists()
-    command_line = ["relmm-train", *arguments]
+    command_line = Arguments(arguments)
     take_over_from_hub(command_line)
     assert summarize(out / "dataset").episodes == 10, "a later attempt completes"
-    assert command_line == ["relmm-train", "--resume=true", f"--output_dir={out}"], "the rest resumes a local run"
+    assert command_line.words == ["--resume=true", f"--output_dir={out}"], "the rest resumes a local run"
 
 
 @pytest.fixture
