@@ -31,6 +31,10 @@ class Phase(IntEnum):
     EVALUATION = 3
 
 
+# What a robot is told to do (`task`): in evaluations and `--mode=clean`, and while it practises.
+TASK = "Pick up all objects and put them into the basket."
+PRACTICE_TASK = "Pick up an object and put it down somewhere else."
+
 # --- Actions -------------------------------------------------------------------------------------------------
 # Every name ends in `.vel` or `.pos`, because LeRobot's rollout drops all others.
 ACTION_NAMES = ("x.vel", "theta.vel", "skill.pos", "skill_x.pos", "skill_y.pos")

@@ -12,11 +12,9 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
 from numpy.typing import NDArray
 
-from relmm.features import ACTION_NAMES, DEPTH_KEY, FRONT, FRONT_DEPTH, IMAGE_KEY, STATE_KEY, STATE_NAMES
+from relmm.features import ACTION_NAMES, DEPTH_KEY, FRONT, FRONT_DEPTH, IMAGE_KEY, STATE_KEY, STATE_NAMES, TASK
 from relmm.policies.controller import ControllerPolicy
 from relmm.policies.pseudo_reset import random_pseudo_reset
-
-TASK = "Pick up all objects and put them into the basket."
 
 
 class Actor:

@@ -22,12 +22,13 @@ from relmm.features import (
     FREE_GRASPS,
     MOTION_NAMES,
     ODOMETRY,
+    PRACTICE_TASK,
+    TASK,
     FloatArray,
     Phase,
     Skill,
 )
 from relmm.geometry import moved
-from relmm.learning.actor import TASK
 
 
 class Recorder(Protocol):
@@ -96,6 +97,7 @@ class Life:
     ) -> None:
         self._robot, self._recorders, self._clock = robot, recorders, clock
         self._max_steps, self.should_stop, self._to_collect = max_steps, should_stop, to_collect
+        self._task = PRACTICE_TASK if to_collect is None else TASK
         self._grasps_since_drive = 0
         self.observation: dict[str, Any] = robot.get_observation()
         self.pose: FloatArray = np.zeros(3)
@@ -147,7 +149,7 @@ class Life:
             "complementary_info.robot_time": seconds,
         }
         for recorder in self._recorders:
-            recorder.add_frame(before, done_action, outcome, TASK)
+            recorder.add_frame(before, done_action, outcome, self._task)
         if done or truncated:
             for recorder in self._recorders:
                 recorder.save_episode()

@@ -9,7 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relmm.errors import ConfigError
-from relmm.features import ACTION_NAMES, FREE_GRASPS, FRONT, IMAGE_SIZE, MAX_THETA_VEL, MAX_X_VEL, STATE_NAMES, Skill
+from relmm.features import (
+    ACTION_NAMES,
+    FREE_GRASPS,
+    FRONT,
+    IMAGE_SIZE,
+    MAX_THETA_VEL,
+    MAX_X_VEL,
+    STATE_NAMES,
+    TASK,
+    Skill,
+)
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.film import Scene
 from relmm.sim.locobot_sim import LocobotSim
@@ -38,7 +48,7 @@ class RelmmRoomEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium reads it from the class)
     task = "Room-v0"
-    task_description = "Pick up all objects and put them into the basket."
+    task_description = TASK
 
     def __init__(
         self,

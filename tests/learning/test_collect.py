@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from relmm.commands.policies import make_actor
-from relmm.features import FREE_GRASPS, Phase, Skill
+from relmm.features import FREE_GRASPS, PRACTICE_TASK, TASK, Phase, Skill
 from relmm.geometry import moved
 from relmm.learning.actor import Actor
 from relmm.learning.collect import Cleaner, Collector
@@ -100,6 +100,7 @@ def test_success_ends_the_episode_and_is_carried_elsewhere(robot):
     assert set(phases[15:]) == {Phase.LEARNING}
     rewards = [outcome["next.reward"] for episode in recorder.episodes for _, _, outcome, _ in episode]
     assert sum(rewards) == 2
+    assert {task for episode in recorder.episodes for *_, task in episode} == {PRACTICE_TASK}
 
 
 # --- Cleaning ------------------------------------------------------------------------------------------------
@@ -121,6 +122,7 @@ def test_cleaning_puts_what_is_picked_up_into_the_basket_and_has_no_pseudo_reset
     assert [outcomes[number - 1]["next.reward"] for number in placed] == [1.0, 1.0], "what was just picked up"
     assert [outcome["next.done"] for outcome in outcomes] == [False] * (len(episode) - 1) + [True]
     assert outcomes[-1]["next.success"]
+    assert {task for *_, task in episode} == {TASK}
 
 
 def test_cleaning_ends_at_the_step_limit_and_goes_on_in_another_room(robot):
