@@ -21,7 +21,8 @@ from relmm.episodes.folder import EPISODE_FILES, INFO, DatasetFolder
 from relmm.episodes.outcomes import with_outcomes
 from relmm.episodes.parquet import are_whole_numbers
 from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
-from relmm.episodes.survey import read_columns, read_places
+from relmm.episodes.survey import PLACE_COLUMNS, read_columns, read_places
+from relmm.episodes.video import VIDEO_COLUMNS, in_video, read_video
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
 
@@ -138,7 +139,7 @@ class EpisodeFollower:
             self._data = self._find_data()
         if self._data is None:
             return
-        data = _DataFiles(self._folder, *self._data)
+        data = _DataFiles(self._folder, self._data)
         for row in self._new_rows():
             episode = data.read(row) if row["episode_index"] == self.next else None
             if episode is None:
@@ -147,14 +148,14 @@ class EpisodeFollower:
             self.next += 1
             yield episode
 
-    def _find_data(self) -> tuple[str, list[str]] | None:
-        """LeRobot's template for data files, and the columns to read."""
+    def _find_data(self) -> _Layout | None:
         info = self._folder.read_json(INFO)
         if info is None:
             return None
         check_trainable(self._folder.root, self._camera)
-        columns = [name for name in TRAINING_COLUMNS if name in info["features"]]
-        return str(info["data_path"]), ["episode_index", "index", *columns]
+        filmed = in_video(info["features"])
+        columns = [name for name in TRAINING_COLUMNS if name in info["features"] and not (filmed and name == IMAGE_KEY)]
+        return _Layout(str(info["data_path"]), ["episode_index", "index", *columns], float(info["fps"]), filmed)
 
     def _new_rows(self) -> Iterator[dict[str, Any]]:
         """Rows of meta/episodes from episode `next` on; reads each file when it is needed."""
@@ -183,6 +184,8 @@ class EpisodeFollower:
     def _rows(self, name: str) -> list[dict[str, Any]] | None:
         inode = self._inode(name)  # before it is read: what comes in between is seen as another one the next time
         table = read_places(self._folder.root / name)
+        if table is not None and self._data is not None and self._data.in_video:
+            table = read_columns(self._folder.root / name, [*PLACE_COLUMNS, *VIDEO_COLUMNS])
         if table is None:
             return None
         rows: list[dict[str, Any]] = table.to_pylist()
@@ -191,20 +194,30 @@ class EpisodeFollower:
         return rows
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """Where a dataset's episodes are: LeRobot's template for data files, their columns, and whether there are videos."""
+
+    data_path: str
+    columns: list[str]
+    fps: float
+    in_video: bool
+
+
 class _DataFiles:
     """Reads episodes from the data files; LeRobot puts several into one file when it edits a dataset."""
 
-    def __init__(self, folder: DatasetFolder, data_path: str, columns: list[str]) -> None:
-        self._folder, self._data_path, self._columns = folder, data_path, columns
+    def __init__(self, folder: DatasetFolder, layout: _Layout) -> None:
+        self._folder, self._layout = folder, layout
         self._name = ""
         self._table: pa.Table | None = None  # the file of the last episode, its pictures still compressed
 
     def read(self, row: dict[str, Any]) -> Episode | None:
         """The episode of a row of meta/episodes; None when its file does not hold it whole."""
-        name = self._data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+        name = self._layout.data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
         if name != self._name:
             self._name = name
-            self._table = read_columns(self._folder.root / name, self._columns)
+            self._table = read_columns(self._folder.root / name, self._layout.columns)
             if self._table is not None and not are_whole_numbers(self._table, ["episode_index", "index"]):
                 self._table = None
         length = row["dataset_to_index"] - row["dataset_from_index"]
@@ -218,17 +231,19 @@ class _DataFiles:
             and np.array_equal(frames["index"].to_numpy(), expected)
             and np.all(frames["episode_index"].to_numpy() == row["episode_index"])
         )
-        return self._episode(row["episode_index"], frames) if whole else None
+        return self._episode(row, frames) if whole else None
 
-    def _episode(self, index: int, frames: pa.Table) -> Episode:
-        where = self._folder.root / self._name
+    def _episode(self, row: dict[str, Any], frames: pa.Table) -> Episode | None:
+        index, where = row["episode_index"], self._folder.root / self._name
         if len(frames) > _MAX_FRAMES:
             raise DatasetError(
                 f"episode {index} in {where} has {len(frames)} frames, and at most {_MAX_FRAMES:,} are plausible; "
                 "choose another dataset."
             )
         try:
-            images = _decode(frames[IMAGE_KEY])
+            images = self._images(row, frames)
+            if images is None:
+                return None
         except (*_WRONG_TYPES, cv2.error) as error:
             raise DatasetError(f"a picture of episode {index} in {where} cannot be read: {error}.") from error
         try:
@@ -238,6 +253,11 @@ class _DataFiles:
             return self._checked(index, images, frames)
         except _WRONG_TYPES as error:
             raise DatasetError(f"episode {index} in {where} cannot be learned from: {error}.") from error
+
+    def _images(self, row: dict[str, Any], frames: pa.Table) -> NDArray[np.uint8] | None:
+        if self._layout.in_video:
+            return read_video(self._folder.root, row, len(frames), self._layout.fps)
+        return _decode(frames[IMAGE_KEY])
 
     def _checked(self, index: int, images: NDArray[np.uint8], frames: pa.Table) -> Episode:
         return Episode(

@@ -126,11 +126,14 @@ def check_trainable(root: Path | str, camera: str | None = None) -> None:
     for key in TRAINING_COLUMNS:
         if key in DERIVED and key not in have:
             continue
-        differences += _differences(f"column {key}", _describe(have.get(key)), _describe(want[key]))
+        feature = have.get(key)
+        if key == IMAGE_KEY and feature is not None and feature["dtype"] == "video":
+            feature = {**feature, "dtype": "image"}
+        differences += _differences(f"column {key}", _describe(feature), _describe(want[key]))
     if differences:
         raise DatasetError(
             f"{root} cannot be trained on: {'; '.join(differences)}; choose a dataset of relmm-record, or of "
-            "lerobot-record with --robot.type=locobot_sim and --dataset.video=false."
+            "lerobot-record with --robot.type=locobot_sim."
         )
     cameras = other_camera(have, camera)
     if cameras is not None:

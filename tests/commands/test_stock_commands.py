@@ -48,7 +48,6 @@ def test_what_lerobot_record_has_recorded_can_be_learned_from(run, tmp_path):
         "--dataset.num_episodes=1",
         "--dataset.episode_time_s=12",
         "--dataset.reset_time_s=0",
-        "--dataset.video=false",
         "--dataset.push_to_hub=false",
         "--play_sounds=false",
     )

@@ -26,7 +26,7 @@ def edit_info(root, change):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda info: info["features"][IMAGE_KEY].update(dtype="video"), "have video .*want image"),
+        (lambda info: info["features"][IMAGE_KEY].update(dtype="uint8"), "have uint8 .*want image"),
         (lambda info: info["features"][IMAGE_KEY].update(shape=[64, 64, 3]), r"have image \(64, 64, 3\).*want image"),
         (lambda info: info["features"].pop(IMAGE_KEY), f"column {IMAGE_KEY}: have no such column"),
         (
