@@ -102,7 +102,7 @@ def _refused(words: str, config_class: type, arguments: Arguments) -> str:
 
 def _quiet() -> None:
     """Only our own words on the terminal; warnings of other libraries that a user can do nothing about are left out."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", force=True)
     logging.getLogger("lerobot").setLevel(logging.ERROR)
     logging.getLogger().setLevel(logging.ERROR)
     logging.getLogger("relmm").setLevel(logging.INFO)

@@ -196,7 +196,7 @@ class EpisodeFollower:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where a dataset's episodes are: LeRobot's template for data files, their columns, and whether there are videos."""
+    """Where a dataset's episodes are: LeRobot's template for data files, their columns, whether there are videos."""
 
     data_path: str
     columns: list[str]

@@ -176,7 +176,9 @@ def test_what_was_measured_before_a_signal_is_kept(number, capsys, monkeypatch, 
     monkeypatch.setattr(command.RelmmRoomEnv, "step", interrupted)
     arguments = ["--policy.type=relmm_random", "--env.navigation_steps=2", "--eval.n_episodes=9", "--eval.n_videos=9"]
     monkeypatch.setattr(sys, "argv", ["relmm-eval", *arguments, f"--output_dir={tmp_path / 'out'}"])
-    command.main()
+    with pytest.raises(SystemExit) as stopped:
+        command.main()
+    assert stopped.value.code == 128 + number
     info = json.loads((tmp_path / "out" / "eval_info.json").read_text())
     finished = info["overall"]["n_episodes"]
     assert 1 <= finished == len(info["per_episode"]) < 5

@@ -17,7 +17,6 @@ def start(module: str, log: Path, *arguments: str) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_recorder_and_trainer_work_together(tmp_path):
     data, run = tmp_path / "data", tmp_path / "run"
     trainer = start(

@@ -37,7 +37,6 @@ def record(run, root: Path, *extra: str, seed: int = 0, episodes: int = 2):
     )
 
 
-@pytest.mark.timeout(300)  # several commands, one after the other
 def test_record_same_seed_writes_same_dataset(run, tmp_path):
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         result = record(run, tmp_path / name, seed=seed)
@@ -48,7 +47,6 @@ def test_record_same_seed_writes_same_dataset(run, tmp_path):
     assert not np.array_equal(a["action"], c["action"])
 
 
-@pytest.mark.timeout(300)  # several commands, one after the other
 def test_record_prints_summary_read_back_from_files_and_resumes(run, tmp_path):
     root = tmp_path / "room"
     first = record(run, root)
@@ -86,7 +84,6 @@ def test_record_carries_what_it_picked_up_elsewhere(run, tmp_path):
     assert not data["next.reward"][second][pseudo_reset].any()
 
 
-@pytest.mark.timeout(300)  # several commands, one after the other
 def test_record_of_cleaning_has_a_room_an_episode_and_goes_on_with_other_rooms(run, tmp_path):
     root = tmp_path / "room"
     arguments = (*SIM, f"--dataset.root={root}", "--policy.type=relmm_scripted", "--mode=clean", "--max_steps=12")
@@ -126,7 +123,6 @@ def test_record_stopped_by_signal_saves_and_finishes(tmp_path, number):
     assert summary.truncated + summary.ended_by_success == summary.episodes, "the cut-off episode is marked truncated"
 
 
-@pytest.mark.timeout(300)  # several commands, one after the other
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_record_ended_before_its_first_episode_goes_on(run, tmp_path, number):
     root = tmp_path / "room"

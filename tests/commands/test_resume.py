@@ -15,6 +15,7 @@ import pytest
 
 from relmm.commands import record as record_module
 from relmm.commands import train as module
+from relmm.commands import training_run
 from relmm.episodes import DurableDataset, read_episodes, summarize, verify_and_repair
 from relmm.episodes.settings import LEROBOT_COLUMNS
 from relmm.learning.progress import read_metrics
@@ -123,7 +124,7 @@ def test_an_episode_saved_while_the_replay_is_rebuilt_is_learned(
     episodes = summarize(data).episodes
     assert learned == [(index, True) for index in range(episodes)]
     learned.clear()
-    read = module.read_episodes
+    read = training_run.read_episodes
 
     def read_beside_a_recorder(root: Path) -> Any:
         yield from read(root)
@@ -133,7 +134,7 @@ def test_an_episode_saved_while_the_replay_is_rebuilt_is_learned(
                 dataset.add_frame(*frame)
             dataset.save_episode()
 
-    monkeypatch.setattr(module, "read_episodes", read_beside_a_recorder)
+    monkeypatch.setattr(training_run, "read_episodes", read_beside_a_recorder)
     call("--resume=true", f"--output_dir={following}", "--steps=5", "--policy.device=cpu")
     assert learned == [*((index, False) for index in range(episodes)), (episodes, True)]
     assert counters(following)["episodes"] == episodes + 1

@@ -287,7 +287,6 @@ def test_upload_again_by_hand(hub, call):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_going_on_on_another_machine(hub, run, tmp_path, tiny):
     def relmm(command, *arguments, home="here"):
         result = run("python", "-m", f"relmm.commands.{command}", *arguments, **ONLINE, HF_HOME=str(tmp_path / home))

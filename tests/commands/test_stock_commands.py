@@ -34,7 +34,6 @@ def recorded(tmp_path_factory) -> Path:
     return root
 
 
-@pytest.mark.timeout(300)  # several commands, one after the other
 def test_what_lerobot_record_has_recorded_can_be_learned_from(run, tmp_path):
     """At LeRobot's own frame rate, and without the columns that only relmm writes."""
     result = run(

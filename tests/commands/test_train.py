@@ -76,7 +76,6 @@ def test_metrics_count_what_the_dataset_holds(finished):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_equal_seeds_give_equal_runs(finished, tmp_path, tiny):
     assert train(*tiny, "--steps=8", f"--output_dir={tmp_path / 'again'}").returncode == 0
     first, second = weights(finished / "checkpoints" / "last"), weights(tmp_path / "again" / "checkpoints" / "last")
@@ -84,7 +83,6 @@ def test_equal_seeds_give_equal_runs(finished, tmp_path, tiny):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_resume_goes_on_with_all_recorded_steps(tmp_path, tiny):
     folder = tmp_path / "run"
     assert train(*tiny, "--steps=4", f"--output_dir={folder}").returncode == 0
@@ -103,7 +101,6 @@ def test_resume_goes_on_with_all_recorded_steps(tmp_path, tiny):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("max_steps", [3, 250], ids=["with saved episodes", "perhaps before the first one"])
 def test_killed_run_resumes(tmp_path, max_steps, tiny):
     folder = tmp_path / "run"

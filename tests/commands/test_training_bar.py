@@ -53,7 +53,7 @@ def test_a_run_ends_at_all_of_everything(run, tiny, tmp_path):
     evaluations = ("--env_eval_freq=2", "--eval.n_episodes=1")
     result = run("relmm-train", *tiny, *evaluations, "--steps=2", "--output_dir=out")
     assert result.returncode == 0, result.stderr
-    last = re.split(r"[\r\n]+", result.stderr.strip())[-1]
+    last = [line for line in re.split(r"[\r\n]+", result.stderr) if " left, " in line][-1]
     assert "100%" in last
     assert "about 0 s left, 6/6 practice, 2/2 steps, 1/1 evaluations" in last
     assert "eval_collected" in json.loads((tmp_path / "out/metrics.jsonl").read_text().splitlines()[-1])

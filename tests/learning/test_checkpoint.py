@@ -126,7 +126,6 @@ while True:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_killed_while_saving_leaves_a_whole_checkpoint(tmp_path):
     code = CHILD.format(folder=os.path.dirname(__file__), target=str(tmp_path / "checkpoints"))
     rng = np.random.default_rng(0)
