@@ -87,7 +87,7 @@ def _cells(grid: dict[str, Any]) -> Figure:
     _heat(figure, axes[0], np.where(attempts > 0, attempts, np.nan), "attempts", "viridis", None)
     _heat(figure, axes[1], 100 * _map(grid["share"]), "success, %", "RdYlBu", (0, 100))
     width = 100 * (_map(grid["high"]) - _map(grid["low"]))
-    _heat(figure, axes[2], width, "width of its 95 % interval, points", "magma_r", (0, 100))
+    _heat(figure, axes[2], width, "width of the interval, points", "magma_r", (0, 100))
     axes[0].set_ylabel("forward of the robot, cm")
     return figure
 

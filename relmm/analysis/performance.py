@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 
 from relmm.analysis.pictures import COLOURS
 from relmm.analysis.statistics import difference, poisson_rate, teaches, wilson
@@ -72,7 +73,7 @@ def curve(grasps: pd.DataFrame, window: int) -> dict[str, list[float]]:
 
 
 def cells(grasps: pd.DataFrame) -> dict[str, Any]:
-    """Attempts and successes of each of the 225 cells, and what one more attempt there would teach.
+    """Attempts and successes of each of the 225 cells, and what one more attempt there would teach of it and its neighbours.
 
     Lists have 225 entries, row by row from near right; shares are None in empty cells.
     """
@@ -87,7 +88,7 @@ def cells(grasps: pd.DataFrame) -> dict[str, Any]:
         "share": _with_none(shares),
         "low": _with_none(low),
         "high": _with_none(high),
-        "teaches": teaches(successes, attempts).tolist(),
+        "teaches": teaches(_with_neighbours(successes), _with_neighbours(attempts)).tolist(),
         "outside": int((grasps["cell"] < 0).sum()),
     }
 
@@ -140,6 +141,12 @@ def next_attempts(grid: dict[str, Any], spread: np.ndarray | None) -> dict[str, 
         ],
         "never_tried": int((np.array(grid["attempts"]) == 0).sum()),
     }
+
+
+def _with_neighbours(counts: Any) -> Any:
+    """Sums over each cell and those round it: a gripper is wider than a cell, so neighbours tell of each other."""
+    padded = np.pad(np.reshape(counts, (GRID, GRID)), 1)
+    return sliding_window_view(padded, (3, 3)).sum(axis=(2, 3)).ravel()
 
 
 def _change(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float, float]:
