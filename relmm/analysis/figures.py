@@ -13,7 +13,7 @@ from relmm.analysis.predictions import Sample
 from relmm.features import GRASP_X, GRASP_Y, GRID
 
 INK = "#010203"  # replaced by the page's colour of text
-STYLE = {
+STYLE: Any = {  # matplotlib has a type of its own for its settings
     "svg.fonttype": "none",
     "font.family": "sans-serif",
     "font.size": 10,
@@ -210,7 +210,7 @@ def _samples(samples: list[Sample]) -> Figure:
             interpolation="none",
         )
         if sample.cell >= 0:
-            bottom.plot(GRID - 1 - sample.cell % GRID, sample.cell // GRID, "o", mfc="none", mec="red", ms=8)
+            bottom.plot(GRID - 1 - sample.cell % GRID, sample.cell // GRID, "o", mfc="none", mec="red", mew=2, ms=9)
         bottom.set_axis_off()
     return figure
 

@@ -45,17 +45,15 @@ def success(grasps: pd.DataFrame, frames: pd.DataFrame) -> dict[str, Any]:
 
 
 def share(outcomes: pd.Series) -> dict[str, Any]:
+    """`counted` of a column of outcomes."""
+    return counted(int(outcomes.sum()), len(outcomes))
+
+
+def counted(successes: int, attempts: int) -> dict[str, Any]:
     """Attempts, successes, and their share with Wilson's interval; None where there is none."""
-    n, s = len(outcomes), int(outcomes.sum())
-    low, high = wilson(s, n)
-    known = n > 0
-    return {
-        "attempts": n,
-        "successes": s,
-        "share": s / n if known else None,
-        "low": float(low) if known else None,
-        "high": float(high) if known else None,
-    }
+    low, high = wilson(successes, attempts)
+    known = {"share": successes / attempts, "low": float(low), "high": float(high)} if attempts else {}
+    return {"attempts": attempts, "successes": successes, "share": None, "low": None, "high": None, **known}
 
 
 def curve(grasps: pd.DataFrame, window: int) -> dict[str, list[float]]:
@@ -73,9 +71,10 @@ def curve(grasps: pd.DataFrame, window: int) -> dict[str, list[float]]:
 
 
 def cells(grasps: pd.DataFrame) -> dict[str, Any]:
-    """Attempts and successes of each of the 225 cells, and what one more attempt there would teach of it and its neighbours.
+    """Attempts and successes of each of the 225 cells, and what one more would teach.
 
-    Lists have 225 entries, row by row from near right; shares are None in empty cells.
+    Lists have 225 entries, row by row from near right; shares are None in empty cells. What one more attempt
+    would teach takes the neighbouring cells into account.
     """
     inside = grasps[grasps["cell"] >= 0]
     attempts = np.bincount(inside["cell"], minlength=GRID**2)
@@ -97,17 +96,16 @@ def best_and_worst(grid: dict[str, Any]) -> dict[str, Any]:
     """The third of the grasp area with the best and with the worst success: near, middle, far; right, centre, left."""
     attempts = np.array(grid["attempts"]).reshape(GRID, GRID)
     successes = np.array(grid["successes"]).reshape(GRID, GRID)
-    third, parts = GRID // 3, []
+    third = GRID // 3
+    parts: list[dict[str, Any]] = []
     for i, depth in enumerate(("near", "middle", "far")):
         for j, side in enumerate(("right", "centre", "left")):
             block = np.s_[i * third : (i + 1) * third, j * third : (j + 1) * third]
-            n, s = int(attempts[block].sum()), int(successes[block].sum())
-            low, high = wilson(s, n)
-            parts.append({"part": f"{depth} {side}", "attempts": n, "successes": s})
-            parts[-1] |= {"share": s / n, "low": float(low), "high": float(high)} if n else {"share": None}
-    known = [part for part in parts if part["share"] is not None]
-    ranked = sorted(known, key=lambda part: part["share"])
-    return {"parts": parts, "best": ranked[-1] if ranked else None, "worst": ranked[0] if ranked else None}
+            parts.append(
+                {"part": f"{depth} {side}", **counted(int(successes[block].sum()), int(attempts[block].sum()))}
+            )
+    known = sorted((part for part in parts if part["attempts"]), key=lambda part: part["share"])
+    return {"parts": parts, "best": known[-1] if known else None, "worst": known[0] if known else None}
 
 
 def groups(grasps: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:

@@ -81,7 +81,7 @@ class Reader:
         self.frames_listed = 0
 
     def read(self, see: Callable[[pd.DataFrame, pa.Table], None], progress: Callable[[int], None]) -> pd.DataFrame:
-        """All frames that are saved by now, as `relmm.analysis.frames` describes them.
+        """All frames that are saved by now, a row each; `with_consequences` adds what only the next frame tells.
 
         Args:
             see: takes the numbers and the table of each episode, pictures included, while they are in memory.
@@ -122,15 +122,22 @@ class Reader:
         rows, name, table = self.rows(), "", None
         self.frames_listed = sum(max(row["length"], 0) for row in rows)
         wanted = ["episode_index", "index", *columns]
-        for row in rows:
-            place = self._data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
-            if place != name:
-                name, table = place, self._file(place, wanted)
+        for number in range(len(rows)):
+            if not (self.root / self._place(rows[number])).is_file():
+                # A recorder that ends packs its small files into a few: then everything is listed anew.
+                rows[number:] = self.rows()[number : len(rows)] or rows[number:]
+            row = rows[number]
+            if self._place(row) != name:
+                name = self._place(row)
+                table = self._file(name, wanted)
             part = None if table is None else _slice(table, row)
             if part is None and table is not None:
                 self._lose(name, "without all the frames that are listed")
             if part is not None:
                 yield row, part
+
+    def _place(self, row: dict[str, Any]) -> str:
+        return self._data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
 
     def _file(self, name: str, wanted: list[str]) -> pa.Table | None:
         table = read_columns(self._folder.root / name, wanted)

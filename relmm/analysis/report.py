@@ -83,7 +83,8 @@ def _save(figure: Figure, name: str, folder: Path) -> str:
 def _surprising(grasps: Path, summary: dict[str, Any]) -> list[dict[str, Any]]:
     """The most surprising attempts with their pictures."""
     rows = summary["surprises"]["attempts"]
-    wanted, pictures = {row["index"] for row in rows}, {}
+    wanted = {row["index"] for row in rows}
+    pictures: dict[int, bytes | None] = {}
     with pq.ParquetFile(grasps) as file:
         for group in range(file.num_row_groups if wanted else 0):
             indices = file.read_row_group(group, ["index"])["index"].to_pylist()

@@ -88,7 +88,8 @@ def export(
         for row, table in reader.episodes(reader.stored_columns):
             progress(row["length"])
             if row["episode_index"] in chosen:
-                wanted = range(len(table)) if whole_episodes else chosen[row["episode_index"]]
+                everything = np.arange(len(table))
+                wanted = everything if whole_episodes else chosen[row["episode_index"]]
                 for frame in wanted:
                     new.add_frame(_frame(table, int(frame)), row["tasks"][0])
                     written += 1
@@ -111,7 +112,7 @@ def _frame(table: pa.Table, number: int) -> dict[str, Any]:
     frame: dict[str, Any] = {IMAGE_KEY: decode_picture(row[IMAGE_KEY]["bytes"])}
     if DEPTH_KEY in row:
         depth = cv2.imdecode(np.frombuffer(row[DEPTH_KEY]["bytes"], np.uint8), cv2.IMREAD_UNCHANGED)
-        frame[DEPTH_KEY] = depth[..., None]
+        frame[DEPTH_KEY] = np.asarray(depth)[..., None]
     for key in ("action", STATE_KEY):
         frame[key] = np.array(row[key], np.float32)
     for key, feature in outcome_features().items():

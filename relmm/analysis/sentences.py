@@ -57,7 +57,9 @@ def _cells(summary: dict[str, Any]) -> str:
         overlap = worst["high"] >= best["low"]
         text += f", and worst at the {worst['part']}, {percent(worst)}"
         text += "; the intervals overlap, so that may be chance" if overlap else ""
-    return f"{text}. {empty} of 225 cells were never tried; they are hatched, which says nothing about them."
+    if not empty:
+        return f"{text}. Every one of its 225 cells was tried."
+    return f"{text}. {empty} of 225 cells were never tried; they are hatched, and nothing is known about them."
 
 
 def _calibration(numbers: dict[str, Any]) -> str:
@@ -155,7 +157,8 @@ def _findings(rows: list[dict[str, Any]]) -> str:
             "Nothing was found: no duplicates, no stretch without success that chance does not explain, no judgement "
             "that the next frame contradicts, no gaps, one camera."
         )
-    return f"{len(rows)} things are worth a look, each with a command where one helps."
+    many = "One thing is" if len(rows) == 1 else f"{len(rows)} things are"
+    return f"{many} worth a look; where a command helps, it is below."
 
 
 def _next(numbers: dict[str, Any]) -> str:
@@ -165,7 +168,6 @@ def _next(numbers: dict[str, Any]) -> str:
         if numbers["by"] == "policy_spread"
         else "where one more attempt narrows the success rate most"
     )
-    return (
-        f"Attempts at {100 * first['x']:.0f} cm forward and {100 * first['y']:+.0f} cm left, {why}; "
-        f"{numbers['never_tried']} cells were never tried."
-    )
+    x, y, empty = 100 * first["x"], 100 * first["y"], numbers["never_tried"]
+    text = f"Attempts at {x:.0f} cm forward and {abs(y):.0f} cm {'left' if y > 0 else 'right'}, {why}"
+    return f"{text}; {empty} cells were never tried." if empty else f"{text}."

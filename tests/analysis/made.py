@@ -30,7 +30,7 @@ def write(root: Path, episodes: list[list[dict[str, Any]]], info: dict[str, Any]
     build, clock, x, noise = FrameBuilder(depth=False).build, 1.0, 0.0, np.random.default_rng(0)
     with DurableDataset.create(REPO_ID, root, False, "locobot_sim", INFO if info is None else info) as dataset:
         holding = False
-        for number, frames in enumerate(episodes):
+        for frames in episodes:
             for frame in frames:
                 seed = frame.get("seed", None)
                 rng = noise if seed is None else np.random.default_rng(seed)

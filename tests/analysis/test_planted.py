@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -86,7 +87,7 @@ def test_most_surprising_attempts_are_failures_that_were_expected_to_work(report
     rows = report[2]["surprises"]["attempts"]
     assert len(rows) == 20
     assert rows[0]["bits"] == pytest.approx(-math.log2(0.1), abs=1e-4)  # a success at 0.1
-    assert all(bits["bits"] >= rest["bits"] for bits, rest in zip(rows, rows[1:], strict=False))
+    assert all(row["bits"] >= after["bits"] for row, after in pairwise(rows))
 
 
 def test_time_is_shared_out(report):
