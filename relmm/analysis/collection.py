@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from relmm.analysis.pictures import Viewer
 from relmm.analysis.predictions import Predictor, Sample
-from relmm.analysis.reading import Reader, cells_of, with_consequences
+from relmm.analysis.reading import Columns, Reader, cells_of, with_consequences
 from relmm.episodes.pictures import decode_picture
 from relmm.features import GRID, IMAGE_KEY, FloatArray, Skill
 
@@ -112,6 +112,18 @@ def _attempts(frames: pd.DataFrame, learned: int | None, predicted: bool) -> pd.
     return grasps.drop(columns=["skill", "x_vel", "theta_vel"])
 
 
+@dataclass(frozen=True)
+class _Attempt:
+    """What is needed of a row of numbers to look at its picture."""
+
+    episode: int
+    frame: int
+    index: int
+    success: bool
+    skill_x: float
+    skill_y: float
+
+
 class _PictureFile:
     """Keeps what pictures show on the disk until all numbers are known."""
 
@@ -147,16 +159,15 @@ class _PictureFile:
         """Of the policy in each cell, on average over the pictures; None without one."""
         return self._spreads / self._predicted if self._predicted else None
 
-    def see(self, frames: pd.DataFrame, table: pa.Table) -> None:
+    def see(self, frames: Columns, table: pa.Table) -> None:
         """Look at the attempts of an episode."""
-        attempts = frames[frames["skill"] == Skill.GRASP]
-        column = table[IMAGE_KEY]
-        looks = []
-        for attempt in attempts.rename(columns={"index": "number"}).itertuples():
-            row: dict[str, Any] = {"index": attempt.number}
+        column, looks = table[IMAGE_KEY], []
+        for place in np.flatnonzero(frames["skill"] == Skill.GRASP):
+            attempt = _Attempt(*(frames[name][place].item() for name in _Attempt.__annotations__))
+            row: dict[str, Any] = {"index": attempt.index}
             self._rows.append(row)
             try:
-                image = decode_picture(column[int(attempt.frame)]["bytes"].as_py())
+                image = decode_picture(column[attempt.frame]["bytes"].as_py())
             except (ValueError, cv2.error):
                 self.broken += 1
                 continue
@@ -167,7 +178,7 @@ class _PictureFile:
         if len(self._rows) >= 1000:
             self._flush()
 
-    def _predict(self, looks: list[tuple[dict[str, Any], Any, Any]]) -> None:
+    def _predict(self, looks: list[tuple[dict[str, Any], Any, _Attempt]]) -> None:
         assert self._predictor is not None
         mean, spread, chance = self._predictor(np.stack([image for _, image, _ in looks]))
         self._spreads += spread.sum(axis=0)
@@ -177,7 +188,7 @@ class _PictureFile:
             row["policy_p_grasp"] = float(chance[i])
             if cell >= 0:
                 row |= {"policy_mean": float(mean[i, cell]), "policy_spread": float(spread[i, cell])}
-            sample = Sample(attempt.episode, attempt.frame, bool(attempt.success), cell, image, mean[i])
+            sample = Sample(attempt.episode, attempt.frame, attempt.success, cell, image, mean[i])
             self._recent[sample.success].append(sample)
 
     def _flush(self) -> None:

@@ -45,6 +45,9 @@ _FOLLOWS_S = 60.0  # a frame that begins later than this after the one before do
 _FOLLOWS_M = 0.5  # nor one that is farther away; a skill moves the base by 0.1 m
 
 
+Columns = dict[str, NDArray[Any]]  # of some frames, by name
+
+
 class Reader:
     """Reads a relmm dataset, which may be growing.
 
@@ -80,21 +83,21 @@ class Reader:
         self._bad_frames = 0
         self.frames_listed = 0
 
-    def read(self, see: Callable[[pd.DataFrame, pa.Table], None], progress: Callable[[int], None]) -> pd.DataFrame:
+    def read(self, see: Callable[[Columns, pa.Table], None], progress: Callable[[int], None]) -> pd.DataFrame:
         """All frames that are saved by now, a row each; `with_consequences` adds what only the next frame tells.
 
         Args:
             see: takes the numbers and the table of each episode, pictures included, while they are in memory.
             progress: takes how many frames were read since the last call.
         """
-        tables = [_no_frames()]
+        parts = [_no_frames()]
         for row, table in self.episodes([IMAGE_KEY, STATE_KEY, "action", *self.columns]):
             frames, lost = self._numbers(row, table)
             self._bad_frames += lost
             see(frames, table)
-            tables.append(frames)
+            parts.append(frames)
             progress(row["length"])
-        return pd.concat([table for table in tables if len(table)] or tables, ignore_index=True)
+        return pd.DataFrame({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
     def rows(self) -> list[dict[str, Any]]:
         """Rows of meta/episodes, as far as its files can be read."""
@@ -161,15 +164,16 @@ class Reader:
         bad = f"{self._bad_frames} frames have numbers that are missing or not finite; they are left out."
         return lost + [bad] * bool(self._bad_frames)
 
-    def _numbers(self, row: dict[str, Any], table: pa.Table) -> tuple[pd.DataFrame, int]:
+    def _numbers(self, row: dict[str, Any], table: pa.Table) -> tuple[Columns, int]:
         """The numbers of an episode, and how many frames had none."""
         filled, known = with_outcomes(_without_nulls(table), DERIVED)
         states, actions = _matrix(filled, STATE_KEY, len(STATE_NAMES)), _matrix(filled, "action", len(ACTION_NAMES))
-        columns: dict[str, Any] = {
-            "episode": row["episode_index"],
+        columns: Columns = {
+            "episode": np.full(len(filled), row["episode_index"]),
             "frame": np.arange(len(filled)),
             "index": filled["index"].to_numpy(),
-            **{name.partition(".")[0]: actions[:, i] for i, name in enumerate(ACTION_NAMES[:2])},
+            "x_vel": actions[:, 0],
+            "theta_vel": actions[:, 1],
             "skill": actions[:, 2].round(),
             "skill_x": actions[:, 3],
             "skill_y": actions[:, 4],
@@ -179,13 +183,13 @@ class Reader:
             "robot_time": _column(filled, "complementary_info.robot_time"),
             **{name: _belief(filled, name) for name in (*BELIEF, *ODOMETRY)},
             "known": known,
-            "fingerprint": _fingerprints(table),
+            "fingerprint": _fingerprints(table, states, actions),
         }
-        frames = pd.DataFrame(columns).rename(columns={"x": "x_vel", "theta": "theta_vel"})
         needed = ["skill", "skill_x", "skill_y", "phase", "robot_time", "x_vel", "theta_vel", "holding"]
-        usable = np.isfinite(frames[needed]).all(axis=1) & np.isfinite(_column(filled, "next.reward"))
-        usable &= frames["skill"].isin(list(Skill)) & frames["phase"].isin(list(Phase))
-        return frames[usable], int((~usable).sum())
+        numbers = np.stack([*(columns[name] for name in needed), _column(filled, "next.reward")])
+        usable = np.isfinite(numbers).all(axis=0)
+        usable &= np.isin(columns["skill"], list(Skill)) & np.isin(columns["phase"], list(Phase))
+        return {name: values[usable] for name, values in columns.items()}, int((~usable).sum())
 
 
 def with_consequences(frames: pd.DataFrame, runs: list[dict[str, Any]]) -> pd.DataFrame:
@@ -275,13 +279,12 @@ def _belief(table: pa.Table, name: str) -> FloatArray:
     return np.where(values < 0, np.nan, values) if name in BELIEF else values
 
 
-def _fingerprints(table: pa.Table) -> NDArray[np.uint64]:
+def _fingerprints(table: pa.Table, states: FloatArray, actions: FloatArray) -> NDArray[np.uint64]:
     """Of picture, state and action: two frames with the same one are copies."""
     pictures = table[IMAGE_KEY].combine_chunks().field("bytes").to_pylist()
-    others = zip(table[STATE_KEY].to_pylist(), table["action"].to_pylist(), strict=True)
     digests = (
-        hashlib.blake2b((picture or b"") + repr(other).encode(), digest_size=8).digest()
-        for picture, other in zip(pictures, others, strict=True)
+        hashlib.blake2b((picture or b"") + state.tobytes() + action.tobytes(), digest_size=8).digest()
+        for picture, state, action in zip(pictures, states, actions, strict=True)
     )
     return np.array([int.from_bytes(digest) for digest in digests], np.uint64)
 
@@ -292,7 +295,7 @@ def _camera_name(features: dict[str, Any]) -> str | None:
     return str(camera.get("name")) if isinstance(camera, dict) else None
 
 
-def _no_frames() -> pd.DataFrame:
+def _no_frames() -> Columns:
     kinds = {"known": bool, "success": bool, "fingerprint": np.uint64, "episode": int, "frame": int, "index": int}
     names = [*kinds, "x_vel", "theta_vel", "skill", "skill_x", "skill_y", "holding", "gripper", "phase", "robot_time"]
-    return pd.DataFrame({name: pd.Series(dtype=kinds.get(name, float)) for name in (*names, *BELIEF, *ODOMETRY)})
+    return {name: np.zeros(0, kinds.get(name, float)) for name in (*names, *BELIEF, *ODOMETRY)}
