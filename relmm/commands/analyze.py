@@ -213,7 +213,7 @@ def _other(config: AnalyzeConfig, root: Path) -> tuple[str, str, dict[str, Any]]
     summary = summarize_collection(collection, name)
     (config.output_dir / "compared" / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
     here = None if config.policy is None else str(config.policy.pretrained_path)
-    return _name(config.dataset.name, here), _name(name, path), summary
+    return _name(config.dataset.name, here), _name(name, path or here), summary
 
 
 def _name(dataset: str, policy: str | None) -> str:
