@@ -28,21 +28,39 @@ def policy_from_path(policy: PreTrainedConfig | None) -> PreTrainedConfig:
     _check_device(said().get("policy.device"))
     path = parser.get_path_arg("policy")
     if path:
-        overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-        folder = fetch_policy(path)
-        try:
-            policy = PreTrainedConfig.from_pretrained(folder, cli_overrides=overrides)
-        except (OSError, ValueError, draccus.utils.DraccusException) as error:
-            raise own_error(error) or ConfigError(
-                f"No policy can be loaded from {path!r} ({' '.join(str(error).split())}): use another checkpoint, or "
-                "the version of relmm that wrote it."
-            ) from error
-        policy.pretrained_path = folder
-        check_features(policy, folder)
-        _forget_owner(policy, overrides)
+        policy = load_config(path, parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or []))
     if policy is None:
         raise ConfigError("No policy was given: say --policy.type=relmm_scripted, or --policy.path=FOLDER_OR_REPO.")
-    if policy.device not in _devices():  # a file's, which LeRobot takes for one of this machine if it begins with cuda
+    return _on_this_machine(policy)
+
+
+def load_config(path: str, overrides: list[str]) -> PreTrainedConfig:
+    """The config of a policy in a folder or on the Hub, ready for `make_actor`.
+
+    Args:
+        path: a folder, or user/repo[@revision].
+        overrides: of its settings, as on the command line, without the name of the policy.
+
+    Raises:
+        ConfigError: there is no policy.
+    """
+    folder = fetch_policy(path)
+    try:
+        policy = PreTrainedConfig.from_pretrained(folder, cli_overrides=overrides)
+    except (OSError, ValueError, draccus.utils.DraccusException) as error:
+        raise own_error(error) or ConfigError(
+            f"No policy can be loaded from {path!r} ({' '.join(str(error).split())}): use another checkpoint, or "
+            "the version of relmm that wrote it."
+        ) from error
+    policy.pretrained_path = folder
+    check_features(policy, folder)
+    _forget_owner(policy, overrides)
+    return _on_this_machine(policy)
+
+
+def _on_this_machine(policy: PreTrainedConfig) -> PreTrainedConfig:
+    """A file's device, which LeRobot takes for one of this machine if it begins with cuda."""
+    if policy.device not in _devices():
         policy.device = _devices()[-1]
     return policy
 

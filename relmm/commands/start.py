@@ -69,6 +69,22 @@ relmm-record: record a robot's life as a LeRobot dataset.
   --seed=0                      of everything random
   --resume=true                 go on with the dataset in its folder
 """,
+    "relmm-analyze": """\
+relmm-analyze: what a robot did, where it grasps well, and whether its confidence can be trusted.
+
+  relmm-analyze --dataset.root=outputs/train/first/dataset --output_dir=report
+  relmm-analyze --dataset.repo_id=USER/NAME --policy.path=USER/POLICY --output_dir=report
+
+  --dataset.repo_id=USER/NAME   or USER/NAME@REVISION; downloaded if it is not here
+  --dataset.root=FOLDER         of the dataset, which may be being recorded
+  --policy.path=DIR             or user/repo[@revision]: what does it expect of each attempt?
+  --where="success == 0"        of some attempts only, as pandas.DataFrame.query takes it
+  --export.root=FOLDER          write these attempts as a dataset
+  --compare.dataset.root=FOLDER another dataset beside this one, or --compare.dataset.repo_id
+  --compare.policy.path=DIR     another policy beside this one
+  --output_dir=FOLDER           new: report.html, summary.json, grasps.parquet, steps.parquet, figures/
+  --overwrite=true              replace the report in that folder
+""",
     "relmm-upload": """\
 relmm-upload: upload the newest checkpoint of a run, and a dataset; what is on the Hub already is not sent again.
 
@@ -99,6 +115,11 @@ def evaluate() -> None:
 def record() -> None:
     """Entry point of `relmm-record`."""
     _start("relmm-record", "record")
+
+
+def analyze() -> None:
+    """Entry point of `relmm-analyze`."""
+    _start("relmm-analyze", "analyze")
 
 
 def upload() -> None:

@@ -20,13 +20,13 @@ from numpy.typing import DTypeLike, NDArray
 from relmm.episodes.folder import EPISODE_FILES, INFO, DatasetFolder
 from relmm.episodes.outcomes import with_outcomes
 from relmm.episodes.parquet import are_whole_numbers
+from relmm.episodes.pictures import decode_picture
 from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
 from relmm.episodes.survey import PLACE_COLUMNS, read_columns, read_places
 from relmm.episodes.video import VIDEO_COLUMNS, in_video, read_video
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _WRONG_TYPES = (ValueError, TypeError, AttributeError, KeyError, pa.ArrowException)  # of columns of other types
 MAX_STEPS = 10_000  # navigation steps of an episode, and of a pseudo-reset before and after it
 _MAX_FRAMES = 5 * MAX_STEPS  # of an episode: they are in memory at once, and a small file may claim any number
@@ -289,18 +289,5 @@ def _decode(column: pa.ChunkedArray) -> NDArray[np.uint8]:
     files = column.combine_chunks().field("bytes").to_pylist()
     images = np.empty((len(files), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
     for image, file in zip(images, files, strict=True):
-        if not file:
-            raise ValueError("it is not in the file, which has only its name")
-        # The size is in the first bytes; a small file may claim gigabytes of pixels.
-        if file[:8] != _PNG_SIGNATURE:
-            raise ValueError("it is no PNG")
-        width, height = (int.from_bytes(file[i : i + 4], "big") for i in (16, 20))
-        if (height, width) != image.shape[:2]:
-            raise ValueError(f"it has the shape {(height, width)}, and {image.shape[:2]} is needed")
-        picture = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise ValueError("it is damaged")
-        if picture.shape != image.shape:
-            raise ValueError(f"it has the shape {picture.shape}, and {image.shape} is needed")
-        image[:] = picture[..., ::-1]  # OpenCV's order is BGR
+        image[:] = decode_picture(file)
     return images

@@ -12,12 +12,19 @@ from relmm.commands.record import RecordConfig
 from relmm.commands.start import SHORT_HELP
 from relmm.commands.train_config import TrainConfig
 
-FUNCTIONS = {"relmm-train": "train", "relmm-eval": "evaluate", "relmm-record": "record", "relmm-upload": "upload"}
+FUNCTIONS = {
+    "relmm-train": "train",
+    "relmm-eval": "evaluate",
+    "relmm-record": "record",
+    "relmm-analyze": "analyze",
+    "relmm-upload": "upload",
+}
 CONFIGS = {TrainConfig: "relmm-train", EvalConfig: "relmm-eval", RecordConfig: "relmm-record"}
 KINDS = {
     "relmm-train": ("--policy.type=relmm", "--robot.type=locobot_sim"),
     "relmm-eval": ("--policy.type=relmm", "--env.type=relmm_room"),
     "relmm-record": ("--policy.type=relmm", "--robot.type=locobot_sim"),
+    "relmm-analyze": ("--policy.type=relmm",),
     "relmm-upload": (),
 }
 

@@ -103,6 +103,13 @@ class GraspEnsemble(nn.Module):
             std[:, rows, columns] = (chances - middle).square_().mean(dim=0).sqrt_()
         return Opinion(mean * self.known, std * self.known)
 
+    @torch.no_grad()
+    def look_at_cells(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """`look(images).cells` without the floor beyond the arm's reach, a tenth of the work."""
+        chances = self.logits(self.area(images)).sigmoid().flatten(2)
+        reach = self.known[-FIRST_ROW : GRID - FIRST_ROW, -FIRST_COLUMN : GRID - FIRST_COLUMN].flatten()
+        return chances.mean(dim=0) * reach, chances.std(dim=0, correction=0) * reach
+
     def logits(self, floor: Tensor, members: int | None = None) -> Tensor:
         """Success logits of all or the first members: any map of the floor (batch, 3, h, w) -> (n, batch, h-8, w-8)."""
         floor = floor.contiguous(memory_format=torch.channels_last)

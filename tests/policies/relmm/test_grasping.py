@@ -330,3 +330,10 @@ def test_equal_seeds_give_equal_weights_and_leave_global_random_numbers_alone(ma
     torch.manual_seed(2)
     assert torch.equal(first, weights(4))
     assert not torch.equal(first, weights(5))
+
+
+@cameras
+def test_looking_at_the_cells_alone_gives_what_looking_at_all_floor_gives(make_ensemble, camera):
+    ensemble = make_ensemble(camera=camera)
+    for whole, alone in zip(ensemble.look(pictures(3)).cells, ensemble.look_at_cells(pictures(3)), strict=True):
+        torch.testing.assert_close(alone, whole)
