@@ -126,7 +126,8 @@ class TrainConfig:
         log_freq: navigation steps between lines of `metrics.jsonl`.
         max_steps: navigation steps after which an episode is cut off.
         pseudo_reset_steps: navigation steps, at most, before and after a picked-up object is put down again.
-        replay_frames: attempts (relmm, 1.6 kB each) or frames (relmm_paper, 30 kB) to learn from, kept in memory.
+        replay_frames: newest attempts (relmm, 1.6 kB each), or attempts and navigation steps (relmm_paper, 30 kB and at
+            most 60 kB), to learn from, kept in memory.
         num_threads: of torch; 1 is the fastest on few cores.
     """
 

@@ -200,5 +200,5 @@ class LearningPolicy(ControllerPolicy):
 
         Args:
             seed: of its batches.
-            capacity: frames to learn from that are kept in memory.
+            capacity: how much of each kind of thing to learn from is kept in memory.
         """

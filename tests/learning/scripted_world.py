@@ -149,3 +149,6 @@ class ScriptedLearner:
 
     def save_episode(self) -> None:
         pass
+
+    def cut_episode(self) -> None:
+        pass

@@ -28,6 +28,8 @@ class RelmmPaperConfig(LearningConfig):
     Args:
         num_members: networks in the grasp ensemble (M).
         grasp_channels: width of their convolutions.
+        grasp_input_gain: of the pixels that they see: 1 for -1..1, 255 for -1..509 as in the code. Without biases,
+            fresh networks are as far apart as their inputs are large.
         mean_weight, std_weight: of the ensemble's mean and standard deviation in the choice of a cell (alpha, beta).
         gate_mean_weight, gate_std_weight: the same in P[grasp].
         grasp_threshold: mean success from which on the greedy policy grasps.
@@ -51,6 +53,9 @@ class RelmmPaperConfig(LearningConfig):
     # --- Grasping -------------------------------------------------------------------------------------------
     num_members: int = 6  # M; the appendix calls it N
     grasp_channels: int = 64
+    # The code forgets to divide pixels by 255. So its fresh members disagree (a spread of 0.43 instead of 0.01) and
+    # P[grasp] is 1 at first; what the paper says of uncertainty was found with that, which is followed.
+    grasp_input_gain: float = 255.0
     # Paper eq. 2. The code applies both to probabilities, inside the softmax only, which is followed.
     mean_weight: float = 10.0
     std_weight: float = 10.0
@@ -73,8 +78,8 @@ class RelmmPaperConfig(LearningConfig):
     navigation_encoder: str = "paper"
     navigation_hidden: int = 512
     # Paper 4.2, each step with its own P[grasp]: the code takes the highest of the batch. It keeps the 0 of a success,
-    # which the paper's Algorithm 1 does not, and that is followed.
-    relabel: bool = True
+    # which the paper's Algorithm 1 does not, and that is followed. The paper's stationary curves are without it.
+    relabel: bool = False
     navigation_learning_rate: float = 3e-4
     navigation_batch_size: int = 128
     navigation_updates: int = 1
@@ -89,6 +94,7 @@ class RelmmPaperConfig(LearningConfig):
         **LearningConfig.ranges,
         "num_members": (1, 100),
         "grasp_channels": (1, 1024),
+        "grasp_input_gain": (_TINY, 255),
         "mean_weight": (0, MANY),
         "std_weight": (0, MANY),
         "gate_mean_weight": (0, MANY),
@@ -134,5 +140,12 @@ class RelmmPaperConfig(LearningConfig):
 
     def fingerprint(self) -> dict[str, Any]:
         """See `LearningConfig.fingerprint`."""
-        names = ("camera", "num_members", "grasp_channels", "navigation_encoder", "navigation_hidden")
+        names = (
+            "camera",
+            "num_members",
+            "grasp_channels",
+            "grasp_input_gain",
+            "navigation_encoder",
+            "navigation_hidden",
+        )
         return {name: getattr(self, name) for name in names}

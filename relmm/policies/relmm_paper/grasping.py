@@ -53,7 +53,7 @@ class GraspEnsemble(nn.Module):
 
     def logits(self, pictures: Tensor) -> Tensor:
         """Success logits of all cells: uint8 (batch, 3, 100, 100) -> (members, batch, 225)."""
-        crop = scaled(pictures[_CROP])  # the code forgets to scale, so that its fresh networks are sure; not followed
+        crop = scaled(pictures[_CROP], self.config.grasp_input_gain)
         return torch.stack([member(crop) for member in self.members])
 
     def estimate(self, pictures: Tensor) -> Estimate:

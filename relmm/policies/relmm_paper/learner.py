@@ -24,7 +24,7 @@ class RelmmPaperLearner(Learner):
     Args:
         policy: to train; its config says how.
         seed: of the batches.
-        capacity: frames to learn from that are kept in memory.
+        capacity: attempts, and navigation steps, that are kept in memory.
 
     Attributes:
         replay: what has been added.
@@ -69,7 +69,7 @@ class RelmmPaperLearner(Learner):
     def update_grasping(self, phase: int) -> None:
         """See `Learner.update_grasping`."""
         attempts = self.replay.attempts
-        begun = len(attempts) >= self.config.min_attempts_to_update and self.replay.available(attempts) > 0
+        begun = len(attempts) >= self.config.min_attempts_to_update
         frozen = self.config.freeze_grasping and phase != Phase.CURRICULUM
         if begun and not frozen:
             for _ in range(self.config.grasp_updates):
@@ -79,13 +79,14 @@ class RelmmPaperLearner(Learner):
         attempts = self.replay.attempts
         rows = self.replay.sample(attempts, self.config.grasp_batch_size, self.rng)
         cells, successes = (self._on_device(attempts[name][rows]) for name in ("cell", "success"))
-        return self.policy.grasping.loss(self._pictures(attempts["frame"][rows]), cells, successes)
+        pictures = to_pictures(self.replay.attempt_pictures[attempts["picture"][rows]], self.policy.weights_device)
+        return self.policy.grasping.loss(pictures, cells, successes)
 
     # --- Navigation ---------------------------------------------------------------------------------------
     def update_navigation(self) -> None:
         """See `Learner.update_navigation`."""
         steps, size = self.replay.steps, self.config.navigation_batch_size
-        if len(steps) >= self.config.min_steps_to_update and self.replay.available(steps) > 0:
+        if len(steps) >= self.config.min_steps_to_update:
             for _ in range(self.config.navigation_updates):
                 batch = self.navigation_batch(self.replay.sample(steps, size, self.rng))
                 noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)
@@ -97,14 +98,14 @@ class RelmmPaperLearner(Learner):
         steps = self.replay.steps
         velocities = np.stack([steps["x_vel"][rows], steps["theta_vel"][rows]], axis=1)
         return self.policy.navigation_batch(
-            self._pictures(steps["frame"][rows]),
+            self._step_pictures(steps["picture"][rows]),
             from_navigation_steps(self._on_device(velocities)),
-            self._pictures(steps["next"][rows]),
+            self._step_pictures(steps["next"][rows]),
             self._on_device(steps["success"][rows]),
         )
 
-    def _pictures(self, frames: NDArray[np.int64]) -> Tensor:
-        return to_pictures(self.replay.pictures(frames), self.policy.weights_device)
+    def _step_pictures(self, numbers: NDArray[np.int64]) -> Tensor:
+        return to_pictures(self.replay.step_pictures[numbers], self.policy.weights_device)
 
     def _on_device(self, values: NDArray[np.generic]) -> Tensor:
         return torch.from_numpy(values).to(self.policy.weights_device)

@@ -20,6 +20,7 @@ PAPER: dict[str, Any] = {
     # 4.1, Appendix "Model Architectures": M = 6 networks of width 64, alpha = beta = 10, N_grasp = 2, rate 3e-4.
     "num_members": 6,
     "grasp_channels": 64,
+    "grasp_input_gain": 255.0,  # what the authors' code does to pixels
     "mean_weight": 10.0,
     "std_weight": 10.0,
     "num_grasp": 2,
@@ -40,7 +41,7 @@ PAPER: dict[str, Any] = {
     # 4.2 and the authors' SAC.
     "navigation_encoder": "paper",
     "navigation_hidden": 512,
-    "relabel": True,
+    "relabel": False,
     "navigation_learning_rate": 3e-4,
     "navigation_batch_size": 128,
     "navigation_updates": 1,

@@ -59,10 +59,21 @@ def test_networks_begin_as_in_keras(ensemble: GraspEnsemble) -> None:
             assert not layer.bias.any()
 
 
+@pytest.mark.parametrize(("gain", "spread", "gate"), [(1.0, (0.0, 0.03), (0.5, 0.6)), (255.0, (0.35, 0.5), (0.99, 1))])
+def test_members_disagree_at_first_as_far_as_their_inputs_are_large(gain, spread, gate) -> None:
+    """Measured on the authors' networks: a spread of 0.43 and P[grasp] of 1 with pixels that are not divided by 255."""
+    torch.manual_seed(0)
+    ensemble = GraspEnsemble(RelmmPaperConfig(device="cpu", grasp_input_gain=gain))
+    floor = torch.tensor([221, 204, 187], dtype=torch.uint8)[:, None, None].expand(2, 3, 100, 100)
+    estimate = ensemble.estimate(floor)
+    assert spread[0] < estimate.std.mean() < spread[1]
+    assert gate[0] <= ensemble.grasp_probability(estimate).mean() <= gate[1]
+
+
 def test_each_picture_of_a_batch_is_judged_alone(ensemble: GraspEnsemble, noise_pictures) -> None:
     pictures = noise_pictures(3)
     alone = torch.cat([ensemble.logits(picture[None]) for picture in pictures], dim=1)
-    assert torch.allclose(ensemble.logits(pictures), alone, atol=1e-5)
+    assert torch.allclose(ensemble.logits(pictures), alone, atol=1e-3), "of logits that reach 60"
 
 
 def test_members_share_nothing(ensemble: GraspEnsemble, noise_pictures) -> None:
@@ -108,7 +119,7 @@ def test_loss_of_certain_members_is_finite(known, set_logits, noise_pictures) ->
 def test_gradient_of_the_loss_agrees_with_finite_differences(
     ensemble: GraspEnsemble, noise_pictures: Callable[[int], Tensor], monkeypatch
 ) -> None:
-    monkeypatch.setattr("relmm.policies.relmm_paper.grasping.scaled", lambda pictures: pictures.double() / 127.5 - 1)
+    monkeypatch.setattr("relmm.policies.relmm_paper.grasping.scaled", lambda pictures, gain: pictures.double() / 127.5)
     ensemble, pictures, cells = ensemble.double(), noise_pictures(3), torch.tensor([0, 100, 224])
     successes = torch.tensor([True, False, True])
     ensemble.loss(pictures, cells, successes)[0].backward()
