@@ -12,7 +12,11 @@ from lerobot.optim.optimizers import AdamConfig
 from relmm.errors import MANY, ConfigError
 from relmm.policies.learning import LearningConfig
 
-NAVIGATION_ENCODERS = ("paper", "paper_small")
+# What a setting may be, by its name.
+CHOICES: dict[str, tuple[str, ...]] = {
+    "navigation": ("sac", "random"),
+    "navigation_encoder": ("paper", "paper_small"),
+}
 
 _TINY = 1e-8
 
@@ -37,6 +41,7 @@ class RelmmPaperConfig(LearningConfig):
         grasp_updates: per attempt.
         freeze_grasping: the ensemble learns in the curriculum only.
 
+        navigation: `sac`, or `random` for the paper's baseline "Rand nav", which drives anywhere at every step.
         navigation_encoder: `paper` or `paper_small`, the convolutions over the picture.
         navigation_hidden: width of the dense layers.
         relabel: reward steps without success with the current P[grasp] - 1 instead of -1.
@@ -75,6 +80,7 @@ class RelmmPaperConfig(LearningConfig):
     num_max: int = 2000
 
     # --- Navigation -----------------------------------------------------------------------------------------
+    navigation: str = "sac"
     navigation_encoder: str = "paper"
     navigation_hidden: int = 512
     # Paper 4.2, each step with its own P[grasp]: the code takes the highest of the batch. It keeps the 0 of a success,
@@ -117,11 +123,9 @@ class RelmmPaperConfig(LearningConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.navigation_encoder not in NAVIGATION_ENCODERS:
-            raise ConfigError(
-                f"policy.navigation_encoder is {self.navigation_encoder!r}: choose one of "
-                f"{', '.join(NAVIGATION_ENCODERS)}."
-            )
+        for name, allowed in CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)!r}: choose one of {', '.join(allowed)}.")
 
     # LeRobot's datasets then give a batch the present frame and as many after it as a navigation step may need.
     @property

@@ -86,7 +86,7 @@ class RelmmPaperLearner(Learner):
     def update_navigation(self) -> None:
         """See `Learner.update_navigation`."""
         steps, size = self.replay.steps, self.config.navigation_batch_size
-        if len(steps) >= self.config.min_steps_to_update:
+        if len(steps) >= self.config.min_steps_to_update and self.config.navigation == "sac":
             for _ in range(self.config.navigation_updates):
                 batch = self.navigation_batch(self.replay.sample(steps, size, self.rng))
                 noise = torch.randn(2, size, ACTIONS, generator=self.noise).to(self.policy.weights_device)

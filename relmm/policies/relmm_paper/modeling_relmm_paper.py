@@ -79,8 +79,9 @@ class RelmmPaperPolicy(LearningPolicy):
         return grasp_cell(cell)
 
     def navigate(self, row: Row) -> dict[str, float]:
-        """A sampled navigation step, or the mean action."""
-        if self.sampling and self.steps_seen < self.config.random_steps:
+        """A sampled navigation step, or the mean action; any at all while there is nothing to choose it by."""
+        begins = self.sampling and self.steps_seen < self.config.random_steps
+        if begins or self.config.navigation == "random":
             return drive_anywhere(row.rng)
         action = self.navigation.act(row.memory[_PICTURES], row.rng if self.sampling else None)[0]
         return to_navigation_step(action.tolist())

@@ -104,6 +104,7 @@ def test_limits_of_a_range_are_allowed(name: str) -> None:
     ("settings", "message"),
     [
         ({"navigation_encoder": "lidar"}, r"policy\.navigation_encoder is 'lidar': choose one of paper, paper_small"),
+        ({"navigation": "slam"}, r"policy\.navigation is 'slam': choose one of sac, random"),
         ({"camera": "webcam"}, "camera 'webcam': choose one of paper, d435"),
     ],
 )

@@ -109,6 +109,14 @@ def test_recorded_frames_teach_as_if_they_had_just_happened(
     assert counts == {"grasping": grasps, "navigation": drives}
 
 
+def test_random_navigation_has_nothing_to_learn(make_learner, count_steps) -> None:
+    learner = make_learner("dddddf", navigation="random", min_attempts_to_update=1)
+    counts = count_steps(learner)
+    learner.update_grasping(Phase.LEARNING)
+    learner.update_navigation()
+    assert counts == {"grasping": 1, "navigation": 0}
+
+
 # --- What it changes -----------------------------------------------------------------------------------------
 def test_each_update_trains_its_own_module(make_learner) -> None:
     learner = make_learner("dfdfs dfds rrddd")

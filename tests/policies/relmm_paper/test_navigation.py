@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, Skill
-from relmm.policies.relmm_paper.configuration_relmm_paper import NAVIGATION_ENCODERS
+from relmm.policies.relmm_paper.configuration_relmm_paper import CHOICES
 from relmm.policies.relmm_paper.navigation import (
     Actor,
     Critics,
@@ -106,7 +106,7 @@ def slope(function: Callable[[], Tensor], weights: list[Tensor], direction: list
 
 
 # --- Networks ------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", NAVIGATION_ENCODERS)
+@pytest.mark.parametrize("kind", CHOICES["navigation_encoder"])
 def test_features_have_the_promised_length(kind: str, noise_pictures) -> None:
     encoder = Encoder(kind)
     assert encoder(noise_pictures(2)).shape == (2, encoder.features)
