@@ -14,6 +14,7 @@ from relmm.policies.learning import LearningConfig
 
 # What a setting may be, by its name.
 CHOICES: dict[str, tuple[str, ...]] = {
+    "grasping": ("discrete", "continuous"),
     "navigation": ("sac", "random"),
     "navigation_encoder": ("paper", "paper_small"),
 }
@@ -30,6 +31,8 @@ class RelmmPaperConfig(LearningConfig):
     silent, a value is that of the released code; where the two disagree, a comment says which is followed.
 
     Args:
+        grasping: `discrete`, the ensemble over 225 cells, or `continuous`, what the paper compares it with: networks
+            that judge any place, and a search for the best (preset `paper_continuous`).
         num_members: networks in the grasp ensemble (M).
         grasp_channels: width of their convolutions.
         grasp_input_gain: of the pixels that they see: 1 for -1..1, 255 for -1..509 as in the code. Without biases,
@@ -56,6 +59,7 @@ class RelmmPaperConfig(LearningConfig):
     """
 
     # --- Grasping -------------------------------------------------------------------------------------------
+    grasping: str = "discrete"
     num_members: int = 6  # M; the appendix calls it N
     grasp_channels: int = 64
     # The code forgets to divide pixels by 255. So its fresh members disagree (a spread of 0.43 instead of 0.01) and
@@ -146,6 +150,7 @@ class RelmmPaperConfig(LearningConfig):
         """See `LearningConfig.fingerprint`."""
         names = (
             "camera",
+            "grasping",
             "num_members",
             "grasp_channels",
             "grasp_input_gain",

@@ -78,9 +78,10 @@ class RelmmPaperLearner(Learner):
     def _grasp_loss(self) -> tuple[Tensor, dict[str, float]]:
         attempts = self.replay.attempts
         rows = self.replay.sample(attempts, self.config.grasp_batch_size, self.rng)
-        cells, successes = (self._on_device(attempts[name][rows]) for name in ("cell", "success"))
+        places = self._on_device(np.stack([attempts["x"][rows], attempts["y"][rows]], axis=1))
+        successes = self._on_device(attempts["success"][rows])
         pictures = to_pictures(self.replay.attempt_pictures[attempts["picture"][rows]], self.policy.weights_device)
-        return self.policy.grasping.loss(pictures, cells, successes)
+        return self.policy.grasping.loss(pictures, places, successes)
 
     # --- Navigation ---------------------------------------------------------------------------------------
     def update_navigation(self) -> None:

@@ -9,11 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.features import BELIEF, GRID
-from relmm.policies.controller import Row, grasp_cell
+from relmm.features import BELIEF, Skill, action_dict
+from relmm.policies.controller import Row
 from relmm.policies.learning import LearningPolicy
 from relmm.policies.pseudo_reset import drive_anywhere
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
+from relmm.policies.relmm_paper.continuous import ContinuousGrasping
 from relmm.policies.relmm_paper.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm_paper.learner import RelmmPaperLearner
 from relmm.policies.relmm_paper.navigation import ACTIONS, Navigation, NavigationBatch, to_navigation_step
@@ -27,7 +28,7 @@ class RelmmPaperPolicy(LearningPolicy):
     """Drives with `navigation`; grasps with `grasping` where that expects success.
 
     Attributes:
-        grasping: the ensemble.
+        grasping: the ensemble, or what takes its place.
         navigation: soft actor-critic.
         attempts_seen: that the ensemble could learn from; while there are few, cells are sampled uniformly.
         steps_seen: navigation steps that SAC could learn from; while there are few, they are sampled uniformly.
@@ -41,7 +42,7 @@ class RelmmPaperPolicy(LearningPolicy):
         super().__init__(config, **kwargs)
         with torch.random.fork_rng():  # the same seed gives the same weights, whatever was drawn before
             torch.manual_seed(config.seed or 0)
-            self.grasping = GraspEnsemble(config)
+            self.grasping = ContinuousGrasping(config) if config.grasping == "continuous" else GraspEnsemble(config)
             self.navigation = Navigation(config)
         self.sampling = config.sample
         # Saved with the weights, so that who acts with these elsewhere explores as the trainer does.
@@ -66,17 +67,15 @@ class RelmmPaperPolicy(LearningPolicy):
         return self.attempt(row) if wants else self.navigate(row)
 
     def attempt(self, row: Row) -> dict[str, float]:
-        """A sampled cell (paper eq. 2), or the best one of the ensemble's mean."""
-        estimate: Estimate = row.memory[_ESTIMATE]
-        if not self.sampling:
-            cell = int(estimate.mean[0].argmax())
-        elif self.attempts_seen < self.config.min_attempts_to_update:
-            cell = int(row.rng.integers(GRID**2))
+        """A sampled place (paper eq. 2), or the best one of the ensemble's mean."""
+        seen = row.memory[_PICTURES], row.memory[_ESTIMATE]
+        if self.sampling and self.attempts_seen < self.config.min_attempts_to_update:
+            place = self.grasping.anywhere(row.rng)
         else:
-            cell = int(self.grasping.sample(estimate, row.rng)[0])
-        mean, std = float(estimate.mean[0, cell]), float(estimate.std[0, cell])
+            place = self.grasping.choose(*seen, row.rng, greedy=not self.sampling)
+        mean, std = self.grasping.opinion(*seen, place)
         row.belief = {**row.belief, "grasp_mean": mean, "grasp_std": std}
-        return grasp_cell(cell)
+        return action_dict(Skill.GRASP, x=float(place[0]), y=float(place[1]))
 
     def navigate(self, row: Row) -> dict[str, float]:
         """A sampled navigation step, or the mean action; any at all while there is nothing to choose it by."""
@@ -129,7 +128,7 @@ class RelmmPaperPolicy(LearningPolicy):
     def _loss_of_attempts(self, attempts: list[Attempt]) -> tuple[Tensor, dict[str, float]]:
         return self.grasping.loss(
             torch.stack([attempt.picture for attempt in attempts]),
-            torch.tensor([attempt.cell for attempt in attempts], device=self.weights_device),
+            torch.stack([attempt.place for attempt in attempts]).to(self.weights_device),
             torch.tensor([attempt.success for attempt in attempts], device=self.weights_device),
         )
 

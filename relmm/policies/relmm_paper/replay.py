@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from relmm.features import IMAGE_SIZE, Phase, Skill, xy_to_cell
+from relmm.features import IMAGE_SIZE, Phase, Skill
 
 Picture = NDArray[np.uint8]
 
@@ -70,7 +70,7 @@ class Replay:
         capacity: attempts, and navigation steps.
 
     Attributes:
-        attempts: `picture` (its number in `attempt_pictures`), `cell`, `success`.
+        attempts: `picture` (its number in `attempt_pictures`), `x` and `y` (m), `success`.
         steps: navigation steps that have led somewhere: `picture` and `next`, before and after (in `step_pictures`),
             `x_vel` and `theta_vel` (m/s and deg/s), and `success`.
         navigation_steps: how many the policy has made while learning, wherever they led.
@@ -79,7 +79,7 @@ class Replay:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.navigation_steps = 0
-        self.attempts = Table(picture=np.int64, cell=np.int64, success=bool)
+        self.attempts = Table(picture=np.int64, x=np.float32, y=np.float32, success=bool)
         self.steps = Table(picture=np.int64, next=np.int64, x_vel=np.float32, theta_vel=np.float32, success=bool)
         self.attempt_pictures, self.step_pictures = Pictures(capacity), Pictures(2 * capacity)
         # The last navigation step, until it is known where it led: its picture, that picture's number if it is kept
@@ -92,7 +92,7 @@ class Replay:
         """Take one frame, as `relmm.policies.learning.Learner.add` does."""
         x_vel, theta_vel, skill, x, y = (float(value) for value in action)
         if round(skill) == Skill.GRASP:
-            self.attempts.append(picture=self.attempt_pictures.add(picture), cell=xy_to_cell(x, y), success=success)
+            self.attempts.append(picture=self.attempt_pictures.add(picture), x=x, y=y, success=success)
             if success:
                 self._close_step(picture, success=True)
             elif self._first_attempt is None:

@@ -12,7 +12,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from relmm.errors import ConfigError
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
-PRESETS = ("paper", "paper_small")
+PRESETS = ("paper", "paper_small", "paper_continuous")
 
 PAPER: dict[str, Any] = {
     "camera": "paper",
@@ -55,6 +55,16 @@ PAPER: dict[str, Any] = {
 SMALL = {"grasp_channels": 32, "grasp_batch_size": 64, "navigation_encoder": "paper_small", "navigation_batch_size": 64}
 
 
+# Appendix "Continuous grasping", as in the authors' code.
+CONTINUOUS = {
+    "grasping": "continuous",
+    "num_members": 2,
+    "grasp_learning_rate": 1e-4,
+    "grasp_batch_size": 256,
+    "min_attempts_to_update": 1000,
+}
+
+
 def preset(name: str) -> PreTrainedConfig:
     text = (files("relmm.policies.relmm_paper") / "presets" / f"{name}.json").read_text(encoding="utf-8")
     return draccus.decode(PreTrainedConfig, {**json.loads(text)["policy"], "device": "cpu"})
@@ -69,7 +79,10 @@ def bad_values() -> list[tuple[str, float]]:
     return cases
 
 
-@pytest.mark.parametrize(("name", "wanted"), [("paper", PAPER), ("paper_small", {**PAPER, **SMALL})])
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [("paper", PAPER), ("paper_small", {**PAPER, **SMALL}), ("paper_continuous", {**PAPER, **CONTINUOUS})],
+)
 def test_preset_has_the_values_of_the_paper(name: str, wanted: dict[str, Any]) -> None:
     config = preset(name)
     assert isinstance(config, RelmmPaperConfig)

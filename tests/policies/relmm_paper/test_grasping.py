@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from relmm.features import GRID
+from relmm.features import GRID, cell_to_xy, xy_to_cell
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
-from relmm.policies.relmm_paper.grasping import Estimate, GraspEnsemble
+from relmm.policies.relmm_paper.grasping import Estimate, GraspEnsemble, to_cells
 
 CELLS = GRID**2
 
@@ -34,6 +34,18 @@ def known(make_config, set_logits) -> tuple[GraspEnsemble, Tensor]:
 def some_estimate(batch: int = 1) -> Estimate:
     mean, std = torch.rand(2, batch, CELLS, generator=torch.Generator().manual_seed(0))
     return Estimate(mean, 0.3 * std)
+
+
+def places(cells: list[int]) -> Tensor:
+    """Centres of cells, as robots are told them."""
+    return torch.from_numpy(cell_to_xy(np.array(cells))).float()
+
+
+def test_places_belong_to_the_cells_that_the_vocabulary_says() -> None:
+    rng = np.random.default_rng(0)
+    some = np.concatenate([cell_to_xy(np.arange(CELLS)), rng.uniform((0.2, -0.2), (0.6, 0.2), (500, 2))])
+    expected = [xy_to_cell(*place) for place in some.tolist()]
+    assert to_cells(torch.from_numpy(some)).tolist() == expected
 
 
 # --- Networks ------------------------------------------------------------------------------------------------
@@ -105,7 +117,7 @@ def test_loss_is_the_cross_entropy_of_the_attempted_cells(known, noise_pictures)
         for cell, success in zip(cells, successes, strict=True):
             chance = 1 / (1 + math.exp(-member[cell]))
             expected -= math.log(chance if success else 1 - chance) / len(cells)
-    loss, logs = ensemble.loss(noise_pictures(4), torch.tensor(cells), torch.tensor(successes))
+    loss, logs = ensemble.loss(noise_pictures(4), places(cells), torch.tensor(successes))
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     assert logs == {"grasp_loss": pytest.approx(expected / 3, rel=1e-5)}
 
@@ -113,7 +125,7 @@ def test_loss_is_the_cross_entropy_of_the_attempted_cells(known, noise_pictures)
 def test_loss_of_certain_members_is_finite(known, set_logits, noise_pictures) -> None:
     ensemble, _ = known
     set_logits(ensemble, torch.full((3, CELLS), 500.0))
-    assert ensemble.loss(noise_pictures(2), torch.tensor([0, 1]), torch.tensor([True, False]))[0].item() == 750.0
+    assert ensemble.loss(noise_pictures(2), places([0, 1]), torch.tensor([True, False]))[0].item() == 750.0
 
 
 def test_gradient_of_the_loss_agrees_with_finite_differences(
@@ -122,7 +134,7 @@ def test_gradient_of_the_loss_agrees_with_finite_differences(
     monkeypatch.setattr("relmm.policies.relmm_paper.grasping.scaled", lambda pictures, gain: pictures.double() / 127.5)
     ensemble, pictures, cells = ensemble.double(), noise_pictures(3), torch.tensor([0, 100, 224])
     successes = torch.tensor([True, False, True])
-    ensemble.loss(pictures, cells, successes)[0].backward()
+    ensemble.loss(pictures, places(cells.tolist()), successes)[0].backward()
     weights = list(ensemble.parameters())
     direction = [torch.randn_like(weight) for weight in weights]
     slope = sum((way * weight.grad).sum() for way, weight in zip(direction, weights, strict=True))

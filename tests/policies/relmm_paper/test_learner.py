@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from relmm.features import FRONT, MAX_THETA_VEL, STATE_NAMES, Phase, Skill, action_dict
+from relmm.features import FRONT, MAX_THETA_VEL, STATE_NAMES, Phase, Skill, action_dict, cell_to_xy
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm_paper.learner import RelmmPaperLearner
 from relmm.policies.relmm_paper.replay import to_pictures
@@ -181,7 +181,7 @@ def test_frames_are_taken_as_recorders_take_them(make_learner, numbered) -> None
     replay = learner.replay
     names = ("x_vel", "theta_vel", "success")
     assert [replay.steps[name].item() for name in names] == pytest.approx([0.1, -MAX_THETA_VEL / 2, True])
-    assert replay.attempts["cell"].tolist() == [17]
+    assert [replay.attempts[name].item() for name in "xy"] == pytest.approx(cell_to_xy(17).tolist())
     pictures = [replay.step_pictures[replay.steps[name]] for name in ("picture", "next")]
     pictures.append(replay.attempt_pictures[replay.attempts["picture"]])
     assert all(np.array_equal(kept[0], numbered(n)) for kept, n in zip(pictures, (0, 1, 1), strict=True))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from relmm.features import GRID, MAX_THETA_VEL, MAX_X_VEL, Phase
+from relmm.features import GRID, MAX_THETA_VEL, MAX_X_VEL, Phase, cell_to_xy
 from relmm.policies.relmm_paper.replay import Replay, Table, to_pictures
 
 Life = list[str]
@@ -96,7 +96,8 @@ def test_steps_of_any_life_are_those_of_the_slow_reference(seed: int, fill: Fill
     attempts = [index for index, kind in enumerate(frames) if kind in "fs"]
     pictures = replay.attempt_pictures[replay.attempts["picture"]]
     assert [number_of(image) for image in pictures] == attempts
-    assert replay.attempts["cell"].tolist() == [frame % GRID**2 for frame in attempts]
+    places = np.stack([replay.attempts[name] for name in "xy"], axis=1)
+    assert places == pytest.approx(cell_to_xy(np.array(attempts) % GRID**2), abs=1e-6)
     assert replay.attempts["success"].tolist() == [frames[frame] == "s" for frame in attempts]
     assert replay.navigation_steps == frames.count("d")
 
