@@ -150,6 +150,8 @@ class Trainer:
             if self.life.should_stop():
                 break
             self._step(action, Phase.PSEUDO_RESET)
+            if action["skill.pos"] == Skill.NAVIGATE:
+                self.learner.update_pseudo_reset()
         self._row.attempts = 0
 
     # --- The robot ----------------------------------------------------------------------------------------

@@ -247,6 +247,13 @@ def test_interventions_are_counted_and_seen(make_run: MakeRun) -> None:
     assert numbers == [1, 2, 4], "the third attempt looks at what the person has done, and is recorded so"
 
 
+def test_each_drive_of_a_pseudo_reset_may_teach(make_run: MakeRun) -> None:
+    run = make_run(World(3, success=0.5))
+    for _ in range(20):
+        run.trainer.navigation_step()
+    assert run.world.resets_learned == run.world.events.count(("drive", Phase.PSEUDO_RESET)) > 0
+
+
 def test_room_is_tidied_now_and_then_and_looked_at_again(make_run: MakeRun) -> None:
     moved: list[int] = []  # steps at which the person was asked
 

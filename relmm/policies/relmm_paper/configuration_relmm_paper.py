@@ -16,6 +16,7 @@ from relmm.policies.learning import LearningConfig
 CHOICES: dict[str, tuple[str, ...]] = {
     "grasping": ("discrete", "continuous"),
     "navigation": ("sac", "random"),
+    "perturbation": ("random", "novelty"),
     "navigation_encoder": ("paper", "paper_small"),
 }
 
@@ -45,6 +46,8 @@ class RelmmPaperConfig(LearningConfig):
         freeze_grasping: the ensemble learns in the curriculum only.
 
         navigation: `sac`, or `random` for the paper's baseline "Rand nav", which drives anywhere at every step.
+        perturbation: pseudo-resets that drive at random, as in the paper, or its baseline R3L: two more policies that
+            look for `novelty`. They learn online only, from the seed's first frame on; not by `lerobot-train`.
         navigation_encoder: `paper` or `paper_small`, the convolutions over the picture.
         navigation_hidden: width of the dense layers.
         relabel: reward steps without success with the current P[grasp] - 1 instead of -1.
@@ -85,6 +88,7 @@ class RelmmPaperConfig(LearningConfig):
 
     # --- Navigation -----------------------------------------------------------------------------------------
     navigation: str = "sac"
+    perturbation: str = "random"
     navigation_encoder: str = "paper"
     navigation_hidden: int = 512
     # Paper 4.2, each step with its own P[grasp]: the code takes the highest of the batch. It keeps the 0 of a success,
@@ -154,6 +158,7 @@ class RelmmPaperConfig(LearningConfig):
             "num_members",
             "grasp_channels",
             "grasp_input_gain",
+            "perturbation",
             "navigation_encoder",
             "navigation_hidden",
         )

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from relmm.features import BELIEF, Skill, action_dict
 from relmm.policies.controller import Row
 from relmm.policies.learning import LearningPolicy
-from relmm.policies.pseudo_reset import drive_anywhere
+from relmm.policies.pseudo_reset import drive_anywhere, driven_pseudo_reset
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 from relmm.policies.relmm_paper.continuous import ContinuousGrasping
 from relmm.policies.relmm_paper.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm_paper.learner import RelmmPaperLearner
 from relmm.policies.relmm_paper.navigation import ACTIONS, Navigation, NavigationBatch, to_navigation_step
 from relmm.policies.relmm_paper.offline import Attempt, Outcomes, Step, read_batch
+from relmm.policies.relmm_paper.perturbation import Perturbation
 from relmm.policies.relmm_paper.replay import to_pictures
 
 _PICTURES, _ESTIMATE = "pictures", "estimate"  # of the last observation, in `Row.memory`
@@ -30,6 +33,7 @@ class RelmmPaperPolicy(LearningPolicy):
     Attributes:
         grasping: the ensemble, or what takes its place.
         navigation: soft actor-critic.
+        perturbations: of pseudo-resets, before and after the object is put down; none where these drive at random.
         attempts_seen: that the ensemble could learn from; while there are few, cells are sampled uniformly.
         steps_seen: navigation steps that SAC could learn from; while there are few, they are sampled uniformly.
     """
@@ -44,6 +48,8 @@ class RelmmPaperPolicy(LearningPolicy):
             torch.manual_seed(config.seed or 0)
             self.grasping = ContinuousGrasping(config) if config.grasping == "continuous" else GraspEnsemble(config)
             self.navigation = Navigation(config)
+            learned = config.perturbation == "novelty"
+            self.perturbations = nn.ModuleList([Perturbation(config) for _ in range(2 * learned)])
         self.sampling = config.sample
         # Saved with the weights, so that who acts with these elsewhere explores as the trainer does.
         self.attempts_seen: Tensor
@@ -84,6 +90,17 @@ class RelmmPaperPolicy(LearningPolicy):
             return drive_anywhere(row.rng)
         action = self.navigation.act(row.memory[_PICTURES], row.rng if self.sampling else None)[0]
         return to_navigation_step(action.tolist())
+
+    def pseudo_reset(self, row: Row, steps: int, holding: Callable[[], bool]) -> Iterator[dict[str, float]]:
+        """See `ControllerPolicy.pseudo_reset`."""
+        if not self.perturbations:
+            return super().pseudo_reset(row, steps, holding)
+        carry, leave = (partial(self._perturb, each, row) for each in self.perturbations)
+        return driven_pseudo_reset(row.rng, steps, holding, carry, leave)
+
+    def _perturb(self, perturbation: nn.Module, row: Row) -> dict[str, float]:
+        assert isinstance(perturbation, Perturbation)
+        return to_navigation_step(perturbation.drives.act(row.memory[_PICTURES], row.rng)[0].tolist())
 
     def _wants_to_grasp(self, row: Row) -> bool:
         estimate: Estimate = row.memory[_ESTIMATE]

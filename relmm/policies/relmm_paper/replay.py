@@ -61,6 +61,55 @@ class Pictures:
         return self._pictures[numbers % len(self._pictures)]
 
 
+class Steps:
+    """The newest navigation steps that have led somewhere, with the pictures before and after them.
+
+    Args:
+        capacity: steps.
+
+    Attributes:
+        table: `picture` and `next`, the numbers of those pictures in `pictures`, `x_vel` and `theta_vel` (m/s and
+            deg/s), and `ended`: whether nothing follows on the step, because it led to a success, say.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.table = Table(picture=np.int64, next=np.int64, x_vel=np.float32, theta_vel=np.float32, ended=bool)
+        self.pictures = Pictures(2 * capacity)
+        # The last step, until it is known where it led: its picture, that picture's number if it is kept already, and
+        # its velocities.
+        self._open: tuple[Picture, int | None, dict[str, float]] | None = None
+        self._closed: tuple[Picture, int] | None = None  # what the last step led to
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def begin(self, picture: Picture, x_vel: float, theta_vel: float) -> None:
+        """Take a step, of which it is not known yet where it leads."""
+        known = self._closed is not None and self._closed[0] is picture
+        number = self._closed[1] if known and self._closed is not None else None
+        self._open = picture, number, {"x_vel": x_vel, "theta_vel": theta_vel}
+
+    def end(self, following: Picture, ended: bool = False) -> None:
+        """Say where the last step led, if there is one that is not ended yet."""
+        self._closed = None
+        if self._open is not None:
+            picture, before, velocities = self._open
+            before = self.pictures.add(picture) if before is None else before
+            number = self.pictures.add(following)
+            self.table.append(picture=before, next=number, ended=ended, **velocities)
+            self._closed = following, number
+        self._open = None
+
+    def forget(self) -> None:
+        """Drop the last step if nobody knows where it led."""
+        self._open = self._closed = None
+
+    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The newest rows, uniformly, with replacement, (count,); there must be one."""
+        return rng.integers(max(len(self) - self.capacity, 0), len(self), count)
+
+
 class Replay:
     """The newest attempts and the newest navigation steps, `capacity` of each, as in the code.
 
@@ -71,8 +120,7 @@ class Replay:
 
     Attributes:
         attempts: `picture` (its number in `attempt_pictures`), `x` and `y` (m), `success`.
-        steps: navigation steps that have led somewhere: `picture` and `next`, before and after (in `step_pictures`),
-            `x_vel` and `theta_vel` (m/s and deg/s), and `success`.
+        steps: of the policy.
         navigation_steps: how many the policy has made while learning, wherever they led.
     """
 
@@ -80,12 +128,8 @@ class Replay:
         self.capacity = capacity
         self.navigation_steps = 0
         self.attempts = Table(picture=np.int64, x=np.float32, y=np.float32, success=bool)
-        self.steps = Table(picture=np.int64, next=np.int64, x_vel=np.float32, theta_vel=np.float32, success=bool)
-        self.attempt_pictures, self.step_pictures = Pictures(capacity), Pictures(2 * capacity)
-        # The last navigation step, until it is known where it led: its picture, that picture's number if it is kept
-        # already, and its velocities.
-        self._open_step: tuple[Picture, int | None, dict[str, float]] | None = None
-        self._first_attempt: Picture | None = None  # before the first attempt since then
+        self.attempt_pictures, self.steps = Pictures(capacity), Steps(capacity)
+        self._first_attempt: Picture | None = None  # before the first attempt since the last navigation step
 
     # --- Filling ------------------------------------------------------------------------------------------
     def add(self, picture: Picture, action: NDArray[np.float32], success: bool, phase: int) -> None:
@@ -94,31 +138,24 @@ class Replay:
         if round(skill) == Skill.GRASP:
             self.attempts.append(picture=self.attempt_pictures.add(picture), x=x, y=y, success=success)
             if success:
-                self._close_step(picture, success=True)
+                self._end_step(picture, success=True)
             elif self._first_attempt is None:
                 self._first_attempt = picture
             return
-        number = self._close_step(picture)
+        self._end_step(picture)
         if round(skill) == Skill.NAVIGATE and phase != Phase.PSEUDO_RESET:
             self.navigation_steps += phase == Phase.LEARNING
-            self._open_step = picture, number, {"x_vel": x_vel, "theta_vel": theta_vel}
+            self.steps.begin(picture, x_vel, theta_vel)
 
     def save_episode(self) -> None:
         """End the episode: what comes next need not follow on."""
         if self._first_attempt is not None:
-            self._close_step(self._first_attempt)
-        self._open_step = self._first_attempt = None
+            self._end_step(self._first_attempt)
+        self.steps.forget()
 
-    def _close_step(self, following: Picture, success: bool = False) -> int | None:
-        """Keep the open step, now that it has led to this picture, and the picture's number, if there is one."""
-        number = None
-        if self._open_step is not None:
-            picture, before, velocities = self._open_step
-            before = self.step_pictures.add(picture) if before is None else before
-            number = self.step_pictures.add(following)
-            self.steps.append(picture=before, next=number, success=success, **velocities)
-        self._open_step = self._first_attempt = None
-        return number
+    def _end_step(self, following: Picture, success: bool = False) -> None:
+        self.steps.end(following, success)
+        self._first_attempt = None
 
     # --- Reading ------------------------------------------------------------------------------------------
     @property
@@ -127,9 +164,9 @@ class Replay:
         successes = self.attempts["success"]
         return len(successes) - int(successes.argmax()) if successes.any() else 0
 
-    def sample(self, table: Table, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The newest rows of one of the tables, uniformly, with replacement, (count,); there must be one."""
-        return rng.integers(max(len(table) - self.capacity, 0), len(table), count)
+    def sample_attempts(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The newest rows, uniformly, with replacement, (count,); there must be one."""
+        return rng.integers(max(len(self.attempts) - self.capacity, 0), len(self.attempts), count)
 
 
 def to_pictures(pictures: NDArray[np.uint8], device: torch.device) -> torch.Tensor:

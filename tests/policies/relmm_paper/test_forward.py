@@ -104,8 +104,8 @@ def test_forward_learns_a_drive_as_the_replay_knows_it(
         assert batch.continues.item() == (not success)
     assert len(seen["navigation"]) == 2
     replay = fill([episode])
-    assert replay.steps["success"][0] == success
-    assert success or number_of(replay.step_pictures[replay.steps["next"][:1]][0]) == after
+    assert replay.steps.table["ended"][0] == success
+    assert success or number_of(replay.steps.pictures[replay.steps.table["next"][:1]][0]) == after
 
 
 @pytest.mark.parametrize("episode", ["d", "dfffd", "dfffs"])

@@ -179,10 +179,10 @@ def test_frames_are_taken_as_recorders_take_them(make_learner, numbered) -> None
         learner.add_frame({FRONT: numbered(number), **dict.fromkeys(STATE_NAMES, 0.0)}, action, outcome, "task")
     learner.save_episode()
     replay = learner.replay
-    names = ("x_vel", "theta_vel", "success")
-    assert [replay.steps[name].item() for name in names] == pytest.approx([0.1, -MAX_THETA_VEL / 2, True])
+    names = ("x_vel", "theta_vel", "ended")
+    assert [replay.steps.table[name].item() for name in names] == pytest.approx([0.1, -MAX_THETA_VEL / 2, True])
     assert [replay.attempts[name].item() for name in "xy"] == pytest.approx(cell_to_xy(17).tolist())
-    pictures = [replay.step_pictures[replay.steps[name]] for name in ("picture", "next")]
+    pictures = [replay.steps.pictures[replay.steps.table[name]] for name in ("picture", "next")]
     pictures.append(replay.attempt_pictures[replay.attempts["picture"]])
     assert all(np.array_equal(kept[0], numbered(n)) for kept, n in zip(pictures, (0, 1, 1), strict=True))
 

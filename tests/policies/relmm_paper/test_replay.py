@@ -52,9 +52,9 @@ def steps_of(life: Life) -> list[Step]:
 
 def rows_of(replay: Replay, number_of) -> list[Step]:
     """The frames are told by their pictures."""
-    steps = replay.steps
-    before, after = ([number_of(image) for image in replay.step_pictures[steps[name]]] for name in ("picture", "next"))
-    return list(zip(before, after, steps["success"].tolist(), strict=True))
+    steps = replay.steps.table
+    before, after = ([number_of(image) for image in replay.steps.pictures[steps[name]]] for name in ("picture", "next"))
+    return list(zip(before, after, steps["ended"].tolist(), strict=True))
 
 
 # --- Transitions ---------------------------------------------------------------------------------------------
@@ -106,8 +106,8 @@ def test_steps_of_any_life_are_those_of_the_slow_reference(seed: int, fill: Fill
 def test_actions_are_those_of_their_frames(seed: int, fill: Fill, number_of) -> None:
     replay = fill(random_life(seed))
     share = np.array([frame % 1000 / 1000 for frame, _, _ in rows_of(replay, number_of)])
-    assert replay.steps["x_vel"] == pytest.approx(share * MAX_X_VEL, abs=1e-6)
-    assert replay.steps["theta_vel"] == pytest.approx(share * MAX_THETA_VEL, abs=1e-4)
+    assert replay.steps.table["x_vel"] == pytest.approx(share * MAX_X_VEL, abs=1e-6)
+    assert replay.steps.table["theta_vel"] == pytest.approx(share * MAX_THETA_VEL, abs=1e-4)
 
 
 def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> None:
@@ -133,14 +133,12 @@ def test_the_newest_rows_of_both_kinds_are_sampled_with_their_pictures(
     life = [*random_life(seed), "drdfs"]  # so that each table has rows
     replay, rng, frames = fill(life, capacity), np.random.default_rng(0), "".join(life)
     attempts = [index for index, kind in enumerate(frames) if kind in "fs"]
-    rows = replay.sample(replay.attempts, 600, rng)
+    rows = replay.sample_attempts(600, rng)
     pictures = replay.attempt_pictures[replay.attempts["picture"][rows]]
     assert {number_of(image) for image in pictures} == set(attempts[-capacity:])
-    rows, steps = replay.sample(replay.steps, 600, rng), replay.steps
-    before, after = (replay.step_pictures[steps[name][rows]] for name in ("picture", "next"))
-    seen = {
-        (number_of(a), number_of(b), bool(c)) for a, b, c in zip(before, after, steps["success"][rows], strict=True)
-    }
+    rows, steps = replay.steps.sample(600, rng), replay.steps.table
+    before, after = (replay.steps.pictures[steps[name][rows]] for name in ("picture", "next"))
+    seen = {(number_of(a), number_of(b), bool(c)) for a, b, c in zip(before, after, steps["ended"][rows], strict=True)}
     assert seen == set(steps_of(life)[-capacity:])
 
 
@@ -152,13 +150,13 @@ def test_neither_pseudo_resets_nor_attempts_push_out_navigation_steps(fill: Fill
 
 def test_picture_between_two_steps_is_kept_once(fill: Fill) -> None:
     replay = fill(["dddd"])
-    assert replay.steps["picture"].tolist() == [0, 1, 2]
-    assert replay.steps["next"].tolist() == [1, 2, 3]
+    assert replay.steps.table["picture"].tolist() == [0, 1, 2]
+    assert replay.steps.table["next"].tolist() == [1, 2, 3]
 
 
 def test_rows_are_sampled_uniformly(fill: Fill) -> None:
     replay = fill(["f" * 20])
-    counts = np.bincount(replay.sample(replay.attempts, 4000, np.random.default_rng(0)), minlength=20)
+    counts = np.bincount(replay.sample_attempts(4000, np.random.default_rng(0)), minlength=20)
     assert ((counts - 200) ** 2 / 200).sum() < 43.8  # chi-squared, 19 degrees of freedom: p = 0.001
 
 
