@@ -154,8 +154,8 @@ class TrainConfig:
         self.policy = policy_from_path(self.policy or ReLMMConfig())
         if not isinstance(self.policy, LearningConfig):
             raise ConfigError(
-                f"relmm-train trains --policy.type=relmm or relmm_paper, not {self.policy.type}: choose one of these, "
-                "or train that one with lerobot-train."
+                f"relmm-train trains --policy.type=relmm, relmm_paper or relmm_single, not {self.policy.type}: choose "
+                "one of these, or train that one with lerobot-train."
             )
         for name, (low, high) in _RANGES.items():
             check_range(name, getattr(self, name), low, high)

@@ -14,7 +14,7 @@ from relmm.policies.learning import Learner
 from relmm.policies.relmm_paper.navigation import ACTIONS, NavigationBatch, from_navigation_steps
 from relmm.policies.relmm_paper.perturbation import Perturbation
 from relmm.policies.relmm_paper.perturbation_learning import PerturbationReplay
-from relmm.policies.relmm_paper.replay import Replay, Steps, to_pictures
+from relmm.policies.relmm_paper.replay import VELOCITIES, Replay, Steps, to_pictures
 
 PERTURBATIONS = "perturbation_before", "perturbation_after"
 MIN_PERTURBATION_STEPS = 300  # before the first update, as in the authors' code
@@ -131,7 +131,7 @@ class RelmmPaperLearner(Learner):
     def _rows(self, steps: Steps, rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Pictures before some steps, their actions, the pictures after them, and which ended something."""
         table, device = steps.table, self.policy.weights_device
-        velocities = np.stack([table["x_vel"][rows], table["theta_vel"][rows]], axis=1)
+        velocities = np.stack([table[name][rows] for name in VELOCITIES], axis=1)
         before, after = (to_pictures(steps.pictures[table[name][rows]], device) for name in ("picture", "next"))
         return before, from_navigation_steps(self._on_device(velocities)), after, self._on_device(table["ended"][rows])
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from relmm.features import Phase, Skill
 from relmm.policies.pseudo_reset import is_turn
-from relmm.policies.relmm_paper.replay import Picture, Steps
+from relmm.policies.relmm_paper.replay import VELOCITIES, Picture, Steps
 
 
 class PerturbationReplay:
@@ -24,7 +24,7 @@ class PerturbationReplay:
     """
 
     def __init__(self, capacity: int) -> None:
-        self.parts = Steps(capacity), Steps(capacity)
+        self.parts = Steps(capacity, *VELOCITIES), Steps(capacity, *VELOCITIES)
         self.newest: int | None = None
         self._part = 0  # of the running pseudo-reset
 
@@ -41,7 +41,7 @@ class PerturbationReplay:
             self._part = 1
         self.newest = self._part if drives else None
         if drives:
-            self.parts[self._part].begin(picture, x_vel, theta_vel)
+            self.parts[self._part].begin(picture, x_vel=x_vel, theta_vel=theta_vel)
 
     def save_episode(self) -> None:
         """End the episode: what comes next need not follow on."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from relmm.features import IMAGE_SIZE, Phase, Skill
 
 Picture = NDArray[np.uint8]
+VELOCITIES = ("x_vel", "theta_vel")  # m/s and deg/s, of a navigation step
 
 
 class Table:
@@ -66,38 +67,39 @@ class Steps:
 
     Args:
         capacity: steps.
+        columns: what is kept of an action.
 
     Attributes:
-        table: `picture` and `next`, the numbers of those pictures in `pictures`, `x_vel` and `theta_vel` (m/s and
-            deg/s), and `ended`: whether nothing follows on the step, because it led to a success, say.
+        table: `picture` and `next`, the numbers of those pictures in `pictures`, the columns, and `ended`: whether
+            nothing follows on the step, because it led to a success, say.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, *columns: str) -> None:
         self.capacity = capacity
-        self.table = Table(picture=np.int64, next=np.int64, x_vel=np.float32, theta_vel=np.float32, ended=bool)
+        self.table = Table(picture=np.int64, next=np.int64, ended=bool, **dict.fromkeys(columns, np.float32))
         self.pictures = Pictures(2 * capacity)
         # The last step, until it is known where it led: its picture, that picture's number if it is kept already, and
-        # its velocities.
+        # the action's numbers.
         self._open: tuple[Picture, int | None, dict[str, float]] | None = None
         self._closed: tuple[Picture, int] | None = None  # what the last step led to
 
     def __len__(self) -> int:
         return len(self.table)
 
-    def begin(self, picture: Picture, x_vel: float, theta_vel: float) -> None:
-        """Take a step, of which it is not known yet where it leads."""
+    def begin(self, picture: Picture, **action: float) -> None:
+        """Take a step, with a number for each column, of which it is not known yet where it leads."""
         known = self._closed is not None and self._closed[0] is picture
         number = self._closed[1] if known and self._closed is not None else None
-        self._open = picture, number, {"x_vel": x_vel, "theta_vel": theta_vel}
+        self._open = picture, number, action
 
     def end(self, following: Picture, ended: bool = False) -> None:
         """Say where the last step led, if there is one that is not ended yet."""
         self._closed = None
         if self._open is not None:
-            picture, before, velocities = self._open
+            picture, before, action = self._open
             before = self.pictures.add(picture) if before is None else before
             number = self.pictures.add(following)
-            self.table.append(picture=before, next=number, ended=ended, **velocities)
+            self.table.append(picture=before, next=number, ended=ended, **action)
             self._closed = following, number
         self._open = None
 
@@ -128,7 +130,7 @@ class Replay:
         self.capacity = capacity
         self.navigation_steps = 0
         self.attempts = Table(picture=np.int64, x=np.float32, y=np.float32, success=bool)
-        self.attempt_pictures, self.steps = Pictures(capacity), Steps(capacity)
+        self.attempt_pictures, self.steps = Pictures(capacity), Steps(capacity, *VELOCITIES)
         self._first_attempt: Picture | None = None  # before the first attempt since the last navigation step
 
     # --- Filling ------------------------------------------------------------------------------------------
@@ -145,7 +147,7 @@ class Replay:
         self._end_step(picture)
         if round(skill) == Skill.NAVIGATE and phase != Phase.PSEUDO_RESET:
             self.navigation_steps += phase == Phase.LEARNING
-            self.steps.begin(picture, x_vel, theta_vel)
+            self.steps.begin(picture, x_vel=x_vel, theta_vel=theta_vel)
 
     def save_episode(self) -> None:
         """End the episode: what comes next need not follow on."""
