@@ -3,6 +3,7 @@
 import relmm.policies.random.configuration_random
 import relmm.policies.relmm.configuration_relmm
 import relmm.policies.relmm_paper.configuration_relmm_paper
+import relmm.policies.relmm_single.configuration_relmm_single
 import relmm.policies.scripted.configuration_scripted
 import relmm.sim.config_locobot_sim
 import relmm.sim.config_relmm_room

@@ -10,7 +10,7 @@ from relmm.commands.arguments import Arguments
 from relmm.errors import ConfigError, suggestion
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
-PRESETS = ("paper", "paper_small")
+PRESETS = ("paper", "paper_small", "paper_continuous")
 
 
 def preset_path(name: str) -> Path:

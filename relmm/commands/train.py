@@ -82,6 +82,7 @@ def _train_on_robot(run: Run) -> None:
                 config.max_steps,
                 should_stop=lambda: run.signals.stopped,
             )
+            person = _person(robot, seed)
             trainer = Trainer(
                 life,
                 run.policy,
@@ -89,8 +90,10 @@ def _train_on_robot(run: Run) -> None:
                 curriculum=config.curriculum.type,
                 pseudo_reset_steps=config.pseudo_reset_steps,
                 rng=run.rng,
-                put_in_reach=_person(robot, seed),
+                put_in_reach=(lambda: False) if person is None else person.put_in_reach,
                 progress=run.progress,
+                tidy=(lambda: 0) if person is None else person.tidy,
+                tidy_every=getattr(config.robot, "tidy_every", 0),
             )
 
             def save() -> None:
@@ -136,10 +139,9 @@ def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:
     )
 
 
-def _person(robot: LocobotRobot, seed: int) -> Callable[[], bool]:
-    if isinstance(robot, LocobotSim):
-        return Person(robot, np.random.default_rng([seed, _PERSON_STREAM])).put_in_reach
-    return lambda: False
+def _person(robot: LocobotRobot, seed: int) -> Person | None:
+    """Beside a simulated robot; nobody helps a real one unasked."""
+    return Person(robot, np.random.default_rng([seed, _PERSON_STREAM])) if isinstance(robot, LocobotSim) else None
 
 
 def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:

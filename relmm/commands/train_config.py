@@ -126,7 +126,8 @@ class TrainConfig:
         log_freq: navigation steps between lines of `metrics.jsonl`.
         max_steps: navigation steps after which an episode is cut off.
         pseudo_reset_steps: navigation steps, at most, before and after a picked-up object is put down again.
-        replay_frames: attempts (relmm, 1.6 kB each) or frames (relmm_paper, 30 kB) to learn from, kept in memory.
+        replay_frames: newest attempts (relmm, 1.6 kB each), or attempts and navigation steps (relmm_paper, 30 kB and at
+            most 60 kB), to learn from, kept in memory.
         num_threads: of torch; 1 is the fastest on few cores.
     """
 
@@ -153,8 +154,8 @@ class TrainConfig:
         self.policy = policy_from_path(self.policy or ReLMMConfig())
         if not isinstance(self.policy, LearningConfig):
             raise ConfigError(
-                f"relmm-train trains --policy.type=relmm or relmm_paper, not {self.policy.type}: choose one of these, "
-                "or train that one with lerobot-train."
+                f"relmm-train trains --policy.type=relmm, relmm_paper or relmm_single, not {self.policy.type}: choose "
+                "one of these, or train that one with lerobot-train."
             )
         for name, (low, high) in _RANGES.items():
             check_range(name, getattr(self, name), low, high)

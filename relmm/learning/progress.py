@@ -24,7 +24,7 @@ class Progress:
         attempts, successes: grasps in all, and those that picked something up.
         objects: picked up outside a curriculum.
         pseudo_reset_steps: navigation steps of pseudo-resets.
-        interventions: times that a person had to put an object into reach.
+        interventions: objects that a person had to put into reach, or to free.
         robot_minutes: on the robot's own clock, over all its lives; the last frame is not over yet.
     """
 

@@ -32,6 +32,8 @@ class Trainer:
         put_in_reach: the person of the stationary curriculum: makes sure that an object lies in the grasp area; returns
             whether something had to be done.
         progress: counts the frames of the run; also one of the life's recorders.
+        tidy: lays what is stuck elsewhere; returns how many objects.
+        tidy_every: navigation steps after which that is done; 0 for never.
     """
 
     def __init__(
@@ -45,11 +47,14 @@ class Trainer:
         rng: np.random.Generator,
         put_in_reach: Callable[[], bool],
         progress: Progress,
+        tidy: Callable[[], int] = lambda: 0,
+        tidy_every: int = 0,
     ) -> None:
         config = policy.config
         self.life, self.policy, self.learner, self.config = life, policy, learner, config
         self.progress, self._row = progress, Row(rng)
         self._put_in_reach, self._pseudo_reset_steps = put_in_reach, pseudo_reset_steps
+        self._tidy, self._tidy_every = tidy, tidy_every
         self._stationary = curriculum == "stationary"
         num_max = config.num_max if curriculum == "autonomous" else 0
         self._autonomous = AutonomousCurriculum(config.num_start, config.num_stop, num_max)
@@ -68,8 +73,7 @@ class Trainer:
             return  # another place, the next time
         if self._put_in_reach():
             self.progress.interventions += 1
-            self.life.look_again()
-            self._observe()
+            self._look_again()
         self._attempt(self.policy.attempt(self._row), Phase.CURRICULUM)
         if not self.in_stationary_curriculum and self.life.holding:
             self._pseudo_reset()
@@ -88,6 +92,14 @@ class Trainer:
         if not self.life.should_stop():
             self._step(action, Phase.LEARNING)
             self.learner.update_navigation()
+            self._let_tidy()
+
+    def _let_tidy(self) -> None:
+        """Now and then, a person frees what is stuck; what the robot saw before does not hold after that."""
+        if self._tidy_every and self.progress.steps % self._tidy_every == 0 and (moved := self._tidy()):
+            self.progress.interventions += moved
+            self.life.cut_episode()
+            self._look_again()
 
     def _grasp_or_navigate(self) -> dict[str, float]:
         """TrainGrasp(N_grasp, False), as often as the gate wants it; then the navigation step that follows."""
@@ -138,11 +150,18 @@ class Trainer:
             if self.life.should_stop():
                 break
             self._step(action, Phase.PSEUDO_RESET)
+            if action["skill.pos"] == Skill.NAVIGATE:
+                self.learner.update_pseudo_reset()
         self._row.attempts = 0
 
     # --- The robot ----------------------------------------------------------------------------------------
     def _step(self, action: dict[str, float], phase: Phase) -> None:
         self.life.step(action, phase, self._row.belief)
+        self._observe()
+
+    def _look_again(self) -> None:
+        """After someone else has changed the room."""
+        self.life.look_again()
         self._observe()
 
     def _observe(self) -> None:

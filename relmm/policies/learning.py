@@ -143,6 +143,9 @@ class Learner(ABC):
     def update_navigation(self) -> None:
         """The updates that follow a navigation step of the policy, if there are enough of them to learn from."""
 
+    def update_pseudo_reset(self) -> None:  # noqa: B027  (most learn nothing from it)
+        """The updates that follow a navigation step of a pseudo-reset; none where these do not learn."""
+
     def add_frame(
         self, observation: dict[str, Any], action: dict[str, float], outcome: dict[str, Any], task: str
     ) -> None:
@@ -163,6 +166,8 @@ class Learner(ABC):
                     self.update_grasping(int(phase))
                 case Skill.NAVIGATE if phase == Phase.LEARNING:
                     self.update_navigation()
+                case Skill.NAVIGATE if phase == Phase.PSEUDO_RESET:
+                    self.update_pseudo_reset()
         self.save_episode()
 
 
@@ -200,5 +205,5 @@ class LearningPolicy(ControllerPolicy):
 
         Args:
             seed: of its batches.
-            capacity: frames to learn from that are kept in memory.
+            capacity: how much of each kind of thing to learn from is kept in memory.
         """

@@ -19,18 +19,36 @@ def drive_anywhere(rng: np.random.Generator) -> dict[str, float]:
     return action_dict(x_vel=rng.uniform(0, MAX_X_VEL), theta_vel=rng.uniform(-MAX_THETA_VEL, MAX_THETA_VEL))
 
 
+def is_turn(x_vel: float, theta_vel: float) -> bool:
+    """Whether a navigation step of a pseudo-reset is one of the turns before and after the object is put down."""
+    return x_vel == 0 and abs(theta_vel) == MAX_THETA_VEL
+
+
 def random_pseudo_reset(
     rng: np.random.Generator, steps: int, holding: Callable[[], bool]
 ) -> Iterator[dict[str, float]]:
-    """The actions of the paper's pseudo-reset, which drives at random.
+    """The actions of the paper's pseudo-reset, which drives at random; see `driven_pseudo_reset`."""
+    return driven_pseudo_reset(rng, steps, holding, *[lambda: drive_anywhere(rng)] * 2)
+
+
+def driven_pseudo_reset(
+    rng: np.random.Generator,
+    steps: int,
+    holding: Callable[[], bool],
+    carry: Callable[[], dict[str, float]],
+    leave: Callable[[], dict[str, float]],
+) -> Iterator[dict[str, float]]:
+    """The actions of a pseudo-reset.
 
     Args:
-        rng: of the drives.
-        steps: random navigation steps before and after the object is put down.
+        rng: of the turns.
+        steps: navigation steps before and after the object is put down.
         holding: whether something is in the gripper now; it may be lost on the way.
+        carry: the next navigation step before.
+        leave: the next one after.
     """
     for _ in range(steps):
-        yield drive_anywhere(rng)
+        yield carry()
     direction = float(rng.choice((-1.0, 1.0)))
     for _ in range(_TURN_ROUND_STEPS):
         yield action_dict(theta_vel=direction * MAX_THETA_VEL)
@@ -40,4 +58,4 @@ def random_pseudo_reset(
     for _ in range(_TURN_AWAY_STEPS):
         yield action_dict(theta_vel=direction * MAX_THETA_VEL)
     for _ in range(steps):
-        yield drive_anywhere(rng)
+        yield leave()

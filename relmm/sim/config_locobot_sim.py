@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from lerobot.robots.config import RobotConfig
 
-from relmm.errors import MAX_SEED, check_range
+from relmm.errors import MANY, MAX_SEED, check_range
 from relmm.geometry import camera_geometry
 from relmm.sim.rooms import Room, make_room
 
@@ -23,6 +23,8 @@ class LocobotSimConfig(RobotConfig):
         seed: where the objects lie and which way the robot looks at first; None for that of the command, or 0.
         camera: `paper` (the authors' simulated camera) or `d435` (a RealSense D435 on the LoCoBot's tower).
         depth: whether observations hold the depth picture too.
+        tidy_every: navigation steps of a training after which a person lays what lies stuck at walls and obstacles
+            elsewhere; each object counts as an intervention. 0 for never.
     """
 
     room: str = "no_obstacles"
@@ -30,11 +32,13 @@ class LocobotSimConfig(RobotConfig):
     seed: int | None = None
     camera: str = "paper"
     depth: bool = False
+    tidy_every: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         camera_geometry(self.camera)
         check_range("robot.seed", self.seed or 0, 0, MAX_SEED)
+        check_range("robot.tidy_every", self.tidy_every, 0, MANY)
         self.make_room().scatter(np.random.default_rng(0))  # says now if the objects do not fit
 
     def make_room(self) -> Room:

@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from relmm.errors import ConfigError, suggestion
 from relmm.features import FloatArray
@@ -133,12 +134,20 @@ class Room:
 
     def _free_places(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Those of `count` random places that keep their distance from walls, obstacles and the robot; (n, 2)."""
-        limit = np.maximum(np.asarray(self.size) / 2 - self.wall_clearance, 0.0)
-        xy = rng.uniform(-limit, limit, (count, 2))
-        free = np.linalg.norm(xy, axis=1) >= self.robot_clearance
-        for obstacle in self.obstacles:
-            free &= obstacle.distance(xy) >= self.obstacle_clearance
+        xy = rng.uniform(-self._limit, self._limit, (count, 2))
+        free = self.is_clear(xy) & (np.linalg.norm(xy, axis=1) >= self.robot_clearance)
         return np.asarray(xy[free])
+
+    def is_clear(self, xy: FloatArray) -> NDArray[np.bool_]:
+        """Whether objects at these places, m, (n, 2), keep their distance from walls and obstacles; (n,)."""
+        clear = (np.abs(xy) <= self._limit).all(axis=1)
+        for obstacle in self.obstacles:
+            clear &= obstacle.distance(xy) >= self.obstacle_clearance
+        return np.asarray(clear)
+
+    @property
+    def _limit(self) -> FloatArray:
+        return np.maximum(np.asarray(self.size) / 2 - self.wall_clearance, 0.0)
 
     def build(self, rng: np.random.Generator) -> mujoco.MjSpec:
         """The room as a MuJoCo spec, objects scattered as `scatter(rng)` would, to attach a robot to and to compile.

@@ -58,6 +58,16 @@ class Truth:
         near = np.linalg.norm(objects - self._data.site_xpos[self._tool], axis=1) < _HELD_DISTANCE
         return bool(np.any(near & (objects[:, 2] > _HELD_HEIGHT)))
 
+    def in_robot_frame(self, xy: FloatArray) -> FloatArray:
+        """A place of the room, m, (2,), as the robot would name it."""
+        x, y, heading = self.robot()
+        cos, sin = math.cos(heading), math.sin(heading)
+        return np.array([[cos, sin], [-sin, cos]]) @ (xy - (x, y))
+
+    def carried(self) -> NDArray[np.intp]:
+        """Numbers of the objects that lie off the floor: in the gripper or the basket."""
+        return np.flatnonzero(self.objects()[:, 2] > _HELD_HEIGHT)
+
     def in_basket(self) -> NDArray[np.intp]:
         """Numbers of the objects that lie in the robot's basket."""
         x, y, z = self.objects_in_robot_frame().T

@@ -136,7 +136,7 @@ BAD = {
     "rate": (["--policy.learning_rate=-1"], "policy.learning_rate is -1"),
     "gamma": (["--policy.type=relmm_paper", "--policy.gamma=1.5"], "policy.gamma is 1.5"),
     "steps": (["--steps=0"], "steps is 0"),
-    "policy": (["--policy.type=relmm_random"], "--policy.type=relmm or relmm_paper"),
+    "policy": (["--policy.type=relmm_random"], "--policy.type=relmm, relmm_paper or relmm_single"),
     "another preset's policy": (["--policy.type=relmm", "--config_path=paper"], "'relmm_paper': leave one of them out"),
     "camera": (["--robot.camera=d435"], "--policy.camera=d435"),
     "unknown camera": (["--policy.camera=fisheye"], "paper, d435"),

@@ -36,6 +36,7 @@ class World:
     holding: bool = False
     stuck: bool = False  # whether nothing can be put down: something is in the way
     looks: int = 0  # observations so far
+    resets_learned: int = 0  # times that it was asked to learn after a step of a pseudo-reset
 
     def __post_init__(self) -> None:
         self._successes, self._wishes = (np.random.default_rng([self.seed, which]) for which in (0, 1))
@@ -143,9 +144,15 @@ class ScriptedLearner:
     def update_navigation(self) -> None:
         self._world.events.append(LEARN_DRIVE)
 
+    def update_pseudo_reset(self) -> None:
+        self._world.resets_learned += 1
+
     # --- As a recorder --------------------------------------------------------------------------------------
     def add_frame(self, observation: Any, action: dict[str, float], outcome: dict[str, Any], task: str) -> None:
         self.outcomes.append({**outcome, "number": number_of(observation[FRONT])})
 
     def save_episode(self) -> None:
+        pass
+
+    def cut_episode(self) -> None:
         pass

@@ -50,6 +50,8 @@ def make_run() -> MakeRun:
         curriculum: str = "none",
         put_in_reach: Callable[[], bool] = lambda: False,
         should_stop: Callable[[], bool] = lambda: False,
+        tidy: Callable[[], int] = lambda: 0,
+        tidy_every: int = 0,
         **settings: Any,
     ) -> Run:
         policy = ScriptedPolicy(RelmmPaperConfig(device="cpu", **settings))
@@ -58,6 +60,7 @@ def make_run() -> MakeRun:
         trainer = Trainer(
             life, policy, learner, curriculum=curriculum, pseudo_reset_steps=PSEUDO_RESET_STEPS,
             rng=np.random.default_rng(0), put_in_reach=put_in_reach, progress=progress,
+            tidy=tidy, tidy_every=tidy_every,
         )  # fmt: skip
         return Run(world, trainer, progress, policy, learner)
 
@@ -242,6 +245,29 @@ def test_interventions_are_counted_and_seen(make_run: MakeRun) -> None:
     assert asked == [False] * 3
     numbers = [outcome["number"] for outcome in run.learner.outcomes]
     assert numbers == [1, 2, 4], "the third attempt looks at what the person has done, and is recorded so"
+
+
+def test_each_drive_of_a_pseudo_reset_may_teach(make_run: MakeRun) -> None:
+    run = make_run(World(3, success=0.5))
+    for _ in range(20):
+        run.trainer.navigation_step()
+    assert run.world.resets_learned == run.world.events.count(("drive", Phase.PSEUDO_RESET)) > 0
+
+
+def test_room_is_tidied_now_and_then_and_looked_at_again(make_run: MakeRun) -> None:
+    moved: list[int] = []  # steps at which the person was asked
+
+    def person() -> int:
+        moved.append(run.progress.steps)
+        return 3 if run.progress.steps == 8 else 0
+
+    run = make_run(World(0, wanted=0.0), tidy=person, tidy_every=4)
+    for _ in range(10):
+        run.trainer.navigation_step()
+    assert moved == [4, 8]
+    assert run.progress.interventions == 3, "each object counts"
+    numbers = [outcome["number"] for outcome in run.learner.outcomes]
+    assert numbers == [1, 2, 3, 4, 5, 6, 7, 8, 10, 11], "a picture is taken anew after something was moved"
 
 
 def test_no_curriculum_is_stationary_by_itself(make_run: MakeRun) -> None:

@@ -12,7 +12,13 @@ from lerobot.optim.optimizers import AdamConfig
 from relmm.errors import MANY, ConfigError
 from relmm.policies.learning import LearningConfig
 
-NAVIGATION_ENCODERS = ("paper", "paper_small")
+# What a setting may be, by its name.
+CHOICES: dict[str, tuple[str, ...]] = {
+    "grasping": ("discrete", "continuous"),
+    "navigation": ("sac", "random"),
+    "perturbation": ("random", "novelty"),
+    "navigation_encoder": ("paper", "paper_small"),
+}
 
 _TINY = 1e-8
 
@@ -26,8 +32,12 @@ class RelmmPaperConfig(LearningConfig):
     silent, a value is that of the released code; where the two disagree, a comment says which is followed.
 
     Args:
+        grasping: `discrete`, the ensemble over 225 cells, or `continuous`, what the paper compares it with: networks
+            that judge any place, and a search for the best (preset `paper_continuous`).
         num_members: networks in the grasp ensemble (M).
         grasp_channels: width of their convolutions.
+        grasp_input_gain: of the pixels that they see: 1 for -1..1, 255 for -1..509 as in the code. Without biases,
+            fresh networks are as far apart as their inputs are large.
         mean_weight, std_weight: of the ensemble's mean and standard deviation in the choice of a cell (alpha, beta).
         gate_mean_weight, gate_std_weight: the same in P[grasp].
         grasp_threshold: mean success from which on the greedy policy grasps.
@@ -35,6 +45,9 @@ class RelmmPaperConfig(LearningConfig):
         grasp_updates: per attempt.
         freeze_grasping: the ensemble learns in the curriculum only.
 
+        navigation: `sac`, or `random` for the paper's baseline "Rand nav", which drives anywhere at every step.
+        perturbation: pseudo-resets that drive at random, as in the paper, or its baseline R3L: two more policies that
+            look for `novelty`. They learn online only, from the seed's first frame on; not by `lerobot-train`.
         navigation_encoder: `paper` or `paper_small`, the convolutions over the picture.
         navigation_hidden: width of the dense layers.
         relabel: reward steps without success with the current P[grasp] - 1 instead of -1.
@@ -49,8 +62,12 @@ class RelmmPaperConfig(LearningConfig):
     """
 
     # --- Grasping -------------------------------------------------------------------------------------------
+    grasping: str = "discrete"
     num_members: int = 6  # M; the appendix calls it N
     grasp_channels: int = 64
+    # The code forgets to divide pixels by 255. So its fresh members disagree (a spread of 0.43 instead of 0.01) and
+    # P[grasp] is 1 at first; what the paper says of uncertainty was found with that, which is followed.
+    grasp_input_gain: float = 255.0
     # Paper eq. 2. The code applies both to probabilities, inside the softmax only, which is followed.
     mean_weight: float = 10.0
     std_weight: float = 10.0
@@ -70,11 +87,13 @@ class RelmmPaperConfig(LearningConfig):
     num_max: int = 2000
 
     # --- Navigation -----------------------------------------------------------------------------------------
+    navigation: str = "sac"
+    perturbation: str = "random"
     navigation_encoder: str = "paper"
     navigation_hidden: int = 512
     # Paper 4.2, each step with its own P[grasp]: the code takes the highest of the batch. It keeps the 0 of a success,
-    # which the paper's Algorithm 1 does not, and that is followed.
-    relabel: bool = True
+    # which the paper's Algorithm 1 does not, and that is followed. The paper's stationary curves are without it.
+    relabel: bool = False
     navigation_learning_rate: float = 3e-4
     navigation_batch_size: int = 128
     navigation_updates: int = 1
@@ -89,6 +108,7 @@ class RelmmPaperConfig(LearningConfig):
         **LearningConfig.ranges,
         "num_members": (1, 100),
         "grasp_channels": (1, 1024),
+        "grasp_input_gain": (_TINY, 255),
         "mean_weight": (0, MANY),
         "std_weight": (0, MANY),
         "gate_mean_weight": (0, MANY),
@@ -111,11 +131,9 @@ class RelmmPaperConfig(LearningConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.navigation_encoder not in NAVIGATION_ENCODERS:
-            raise ConfigError(
-                f"policy.navigation_encoder is {self.navigation_encoder!r}: choose one of "
-                f"{', '.join(NAVIGATION_ENCODERS)}."
-            )
+        for name, allowed in CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)!r}: choose one of {', '.join(allowed)}.")
 
     # LeRobot's datasets then give a batch the present frame and as many after it as a navigation step may need.
     @property
@@ -134,5 +152,14 @@ class RelmmPaperConfig(LearningConfig):
 
     def fingerprint(self) -> dict[str, Any]:
         """See `LearningConfig.fingerprint`."""
-        names = ("camera", "num_members", "grasp_channels", "navigation_encoder", "navigation_hidden")
+        names = (
+            "camera",
+            "grasping",
+            "num_members",
+            "grasp_channels",
+            "grasp_input_gain",
+            "perturbation",
+            "navigation_encoder",
+            "navigation_hidden",
+        )
         return {name: getattr(self, name) for name in names}

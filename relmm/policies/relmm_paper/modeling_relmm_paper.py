@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
-from relmm.features import BELIEF, GRID
-from relmm.policies.controller import Row, grasp_cell
+from relmm.features import BELIEF, Skill, action_dict
+from relmm.policies.controller import Row
 from relmm.policies.learning import LearningPolicy
-from relmm.policies.pseudo_reset import drive_anywhere
+from relmm.policies.pseudo_reset import drive_anywhere, driven_pseudo_reset
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
+from relmm.policies.relmm_paper.continuous import ContinuousGrasping
 from relmm.policies.relmm_paper.grasping import Estimate, GraspEnsemble
 from relmm.policies.relmm_paper.learner import RelmmPaperLearner
 from relmm.policies.relmm_paper.navigation import ACTIONS, Navigation, NavigationBatch, to_navigation_step
 from relmm.policies.relmm_paper.offline import Attempt, Outcomes, Step, read_batch
+from relmm.policies.relmm_paper.perturbation import Perturbation
 from relmm.policies.relmm_paper.replay import to_pictures
 
 _PICTURES, _ESTIMATE = "pictures", "estimate"  # of the last observation, in `Row.memory`
@@ -27,8 +31,9 @@ class RelmmPaperPolicy(LearningPolicy):
     """Drives with `navigation`; grasps with `grasping` where that expects success.
 
     Attributes:
-        grasping: the ensemble.
+        grasping: the ensemble, or what takes its place.
         navigation: soft actor-critic.
+        perturbations: of pseudo-resets, before and after the object is put down; none where these drive at random.
         attempts_seen: that the ensemble could learn from; while there are few, cells are sampled uniformly.
         steps_seen: navigation steps that SAC could learn from; while there are few, they are sampled uniformly.
     """
@@ -41,8 +46,10 @@ class RelmmPaperPolicy(LearningPolicy):
         super().__init__(config, **kwargs)
         with torch.random.fork_rng():  # the same seed gives the same weights, whatever was drawn before
             torch.manual_seed(config.seed or 0)
-            self.grasping = GraspEnsemble(config)
+            self.grasping = ContinuousGrasping(config) if config.grasping == "continuous" else GraspEnsemble(config)
             self.navigation = Navigation(config)
+            learned = config.perturbation == "novelty"
+            self.perturbations = nn.ModuleList([Perturbation(config) for _ in range(2 * learned)])
         self.sampling = config.sample
         # Saved with the weights, so that who acts with these elsewhere explores as the trainer does.
         self.attempts_seen: Tensor
@@ -66,24 +73,34 @@ class RelmmPaperPolicy(LearningPolicy):
         return self.attempt(row) if wants else self.navigate(row)
 
     def attempt(self, row: Row) -> dict[str, float]:
-        """A sampled cell (paper eq. 2), or the best one of the ensemble's mean."""
-        estimate: Estimate = row.memory[_ESTIMATE]
-        if not self.sampling:
-            cell = int(estimate.mean[0].argmax())
-        elif self.attempts_seen < self.config.min_attempts_to_update:
-            cell = int(row.rng.integers(GRID**2))
+        """A sampled place (paper eq. 2), or the best one of the ensemble's mean."""
+        seen = row.memory[_PICTURES], row.memory[_ESTIMATE]
+        if self.sampling and self.attempts_seen < self.config.min_attempts_to_update:
+            place = self.grasping.anywhere(row.rng)
         else:
-            cell = int(self.grasping.sample(estimate, row.rng)[0])
-        mean, std = float(estimate.mean[0, cell]), float(estimate.std[0, cell])
+            place = self.grasping.choose(*seen, row.rng, greedy=not self.sampling)
+        mean, std = self.grasping.opinion(*seen, place)
         row.belief = {**row.belief, "grasp_mean": mean, "grasp_std": std}
-        return grasp_cell(cell)
+        return action_dict(Skill.GRASP, x=float(place[0]), y=float(place[1]))
 
     def navigate(self, row: Row) -> dict[str, float]:
-        """A sampled navigation step, or the mean action."""
-        if self.sampling and self.steps_seen < self.config.random_steps:
+        """A sampled navigation step, or the mean action; any at all while there is nothing to choose it by."""
+        begins = self.sampling and self.steps_seen < self.config.random_steps
+        if begins or self.config.navigation == "random":
             return drive_anywhere(row.rng)
         action = self.navigation.act(row.memory[_PICTURES], row.rng if self.sampling else None)[0]
         return to_navigation_step(action.tolist())
+
+    def pseudo_reset(self, row: Row, steps: int, holding: Callable[[], bool]) -> Iterator[dict[str, float]]:
+        """See `ControllerPolicy.pseudo_reset`."""
+        if not self.perturbations:
+            return super().pseudo_reset(row, steps, holding)
+        carry, leave = (partial(self._perturb, each, row) for each in self.perturbations)
+        return driven_pseudo_reset(row.rng, steps, holding, carry, leave)
+
+    def _perturb(self, perturbation: nn.Module, row: Row) -> dict[str, float]:
+        assert isinstance(perturbation, Perturbation)
+        return to_navigation_step(perturbation.drives.act(row.memory[_PICTURES], row.rng)[0].tolist())
 
     def _wants_to_grasp(self, row: Row) -> bool:
         estimate: Estimate = row.memory[_ESTIMATE]
@@ -128,7 +145,7 @@ class RelmmPaperPolicy(LearningPolicy):
     def _loss_of_attempts(self, attempts: list[Attempt]) -> tuple[Tensor, dict[str, float]]:
         return self.grasping.loss(
             torch.stack([attempt.picture for attempt in attempts]),
-            torch.tensor([attempt.cell for attempt in attempts], device=self.weights_device),
+            torch.stack([attempt.place for attempt in attempts]).to(self.weights_device),
             torch.tensor([attempt.success for attempt in attempts], device=self.weights_device),
         )
 

@@ -85,11 +85,16 @@ class Actor(nn.Module):
     def sample(self, pictures: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Actions -1..1, (batch, 2), and their log-densities, (batch,), for standard normal noise, (batch, 2)."""
         mean, log_std = self(pictures)
-        raw = mean + log_std.exp() * noise
-        log_density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-        # log(1 - tanh(x)^2), in a form that does not overflow.
-        correction = 2 * (math.log(2) - raw - functional.softplus(-2 * raw))
-        return raw.tanh(), (log_density - correction).sum(dim=-1)
+        return draw(mean, log_std, noise)
+
+
+def draw(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Actions of a tanh-Gaussian, -1..1, (batch, n), and their log-densities, (batch,), for standard normal noise."""
+    raw = mean + log_std.exp() * noise
+    log_density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+    # log(1 - tanh(x)^2), in a form that does not overflow.
+    correction = 2 * (math.log(2) - raw - functional.softplus(-2 * raw))
+    return raw.tanh(), (log_density - correction).sum(dim=-1)
 
 
 class Critics(nn.Module):
@@ -150,7 +155,9 @@ class Navigation(nn.Module):
             noise: standard normal, (2, batch, 2): for the actions at this and at the next picture.
 
         Returns:
-            The loss and its parts, for logs.
+            The loss and, for logs, its parts, and whether it can be seen that pictures matter: `value_spread` and
+            `actor_spread` are standard deviations over the batch's pictures, of values and of greedy actions;
+            `actor_std` is what the actor adds to its mean.
         """
         temperature = self.log_temperature.exp().detach()
         targets = self.bellman_targets(batch, noise[1], temperature)
@@ -158,7 +165,8 @@ class Navigation(nn.Module):
         values = self.critics(features, batch.actions)
         critic_loss = functional.mse_loss(values, targets.expand_as(values))
 
-        actions, log_density = self.actor.sample(batch.pictures, noise[0])
+        mean, log_std = self.actor(batch.pictures)
+        actions, log_density = draw(mean, log_std, noise[0])
         # Through the critics to the actions, but not into the critics.
         self.critics.requires_grad_(False)
         reached = self.critics([each.detach() for each in features], actions).amin(dim=0)
@@ -173,6 +181,9 @@ class Navigation(nn.Module):
             "temperature": temperature.item(),
             "entropy": -log_density.detach().mean().item(),
             "value": values.detach().mean().item(),
+            "value_spread": values.detach().std(dim=1, correction=0).mean().item(),
+            "actor_spread": mean.detach().tanh().std(dim=0, correction=0).mean().item(),
+            "actor_std": log_std.detach().exp().mean().item(),
         }
         return critic_loss + actor_loss + temperature_loss, logs
 

@@ -6,9 +6,14 @@ import torch
 from torch import Tensor, nn
 
 
-def scaled(pictures: Tensor) -> Tensor:
-    """Uint8 pictures, (batch, 3, height, width), as -1..1, in the memory layout that is fastest for convolutions."""
-    return (pictures.float() / 127.5 - 1).contiguous(memory_format=torch.channels_last)
+def scaled(pictures: Tensor, gain: float = 1.0) -> Tensor:
+    """Uint8 pictures, (batch, 3, height, width), as networks see them, in the fastest memory layout for convolutions.
+
+    Args:
+        pictures: as robots take them.
+        gain: 1 for -1..1, 255 for -1..509.
+    """
+    return (pictures.float() * (gain / 127.5) - 1).contiguous(memory_format=torch.channels_last)
 
 
 def strided_convolutions(width: int) -> list[nn.Module]:

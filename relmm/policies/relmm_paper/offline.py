@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_KEY, STATE_NAMES, Skill, carried_out, xy_to_cell
+from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_KEY, STATE_NAMES, Skill, carried_out
 from relmm.policies.learning import no_rewards
 from relmm.policies.relmm_paper.navigation import from_navigation_steps
 
@@ -27,13 +27,13 @@ class Attempt:
     Attributes:
         frame: its own.
         picture: before it, uint8 (3, 100, 100).
-        cell: attempted.
+        place: where, m, (2,).
         success: whether it picked something up.
     """
 
     frame: Frame
     picture: Tensor
-    cell: int
+    place: Tensor
     success: bool
 
 
@@ -68,10 +68,9 @@ def read_batch(batch: dict[str, Any]) -> tuple[list[Attempt], list[Step]]:
     for row, (skills, first) in enumerate(zip(actions[..., _SKILL].round().tolist(), indices, strict=True)):
         frames = [(datasets[row], first + time) for time in range(len(skills))]
         if skills[0] == Skill.GRASP:
-            cell = xy_to_cell(*actions[row, 0, [_X, _Y]].tolist())
             success = successes[row]
             if success is not None:
-                attempts.append(Attempt(frames[0], pictures[row, 0], cell, success))
+                attempts.append(Attempt(frames[0], pictures[row, 0], actions[row, 0, [_X, _Y]], success))
         elif skills[0] == Skill.NAVIGATE:
             after = _after(skills, padded[row])
             # Not there are the picture after an episode's last frame, and what came of a curriculum's many attempts.

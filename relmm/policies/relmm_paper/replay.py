@@ -1,7 +1,4 @@
-"""The replay: the frames of a robot's life in memory, and the attempts and navigation steps among them.
-
-Pictures are kept once, as uint8; a step's next picture is that of a later frame.
-"""
+"""The replay: the attempts and navigation steps of a robot's life in memory, with their pictures as uint8."""
 
 from __future__ import annotations
 
@@ -11,7 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from relmm.features import IMAGE_SIZE, Phase, Skill, xy_to_cell
+from relmm.features import IMAGE_SIZE, Phase, Skill
+
+Picture = NDArray[np.uint8]
+VELOCITIES = ("x_vel", "theta_vel")  # m/s and deg/s, of a navigation step
 
 
 class Table:
@@ -40,60 +40,124 @@ class Table:
         return self._columns[name][: self._length]
 
 
-class Replay:
-    """Frames, attempts and navigation steps.
-
-    A frame's number counts from the first frame ever added; the newest `capacity` frames are kept. The random drives of
-    pseudo-resets are no navigation steps, as in the paper.
+class Pictures:
+    """The newest pictures; each has a number, counted from the first.
 
     Args:
-        capacity: frames; a picture takes 30 kB.
+        capacity: how many; one takes 30 kB, but no memory until it is written to.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+        self._added = 0
+
+    def add(self, picture: Picture) -> int:
+        """Take one, (100, 100, 3); its number."""
+        number, self._added = self._added, self._added + 1
+        self._pictures[number % len(self._pictures)] = picture
+        return number
+
+    def __getitem__(self, numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """By number, (n, 100, 100, 3)."""
+        return self._pictures[numbers % len(self._pictures)]
+
+
+class Steps:
+    """The newest navigation steps that have led somewhere, with the pictures before and after them.
+
+    Args:
+        capacity: steps.
+        columns: what is kept of an action.
 
     Attributes:
-        attempts: `frame`, `cell`, `success`.
-        steps: navigation steps that have led somewhere: `frame`, `next` (frame of the picture after it), `x_vel` and
-            `theta_vel` (m/s and deg/s), and `success`.
+        table: `picture` and `next`, the numbers of those pictures in `pictures`, the columns, and `ended`: whether
+            nothing follows on the step, because it led to a success, say.
+    """
+
+    def __init__(self, capacity: int, *columns: str) -> None:
+        self.capacity = capacity
+        self.table = Table(picture=np.int64, next=np.int64, ended=bool, **dict.fromkeys(columns, np.float32))
+        self.pictures = Pictures(2 * capacity)
+        # The last step, until it is known where it led: its picture, that picture's number if it is kept already, and
+        # the action's numbers.
+        self._open: tuple[Picture, int | None, dict[str, float]] | None = None
+        self._closed: tuple[Picture, int] | None = None  # what the last step led to
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def begin(self, picture: Picture, **action: float) -> None:
+        """Take a step, with a number for each column, of which it is not known yet where it leads."""
+        known = self._closed is not None and self._closed[0] is picture
+        number = self._closed[1] if known and self._closed is not None else None
+        self._open = picture, number, action
+
+    def end(self, following: Picture, ended: bool = False) -> None:
+        """Say where the last step led, if there is one that is not ended yet."""
+        self._closed = None
+        if self._open is not None:
+            picture, before, action = self._open
+            before = self.pictures.add(picture) if before is None else before
+            number = self.pictures.add(following)
+            self.table.append(picture=before, next=number, ended=ended, **action)
+            self._closed = following, number
+        self._open = None
+
+    def forget(self) -> None:
+        """Drop the last step if nobody knows where it led."""
+        self._open = self._closed = None
+
+    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The newest rows, uniformly, with replacement, (count,); there must be one."""
+        return rng.integers(max(len(self) - self.capacity, 0), len(self), count)
+
+
+class Replay:
+    """The newest attempts and the newest navigation steps, `capacity` of each, as in the code.
+
+    The random drives of pseudo-resets are no navigation steps, as in the paper; their pictures are not kept.
+
+    Args:
+        capacity: attempts, and navigation steps.
+
+    Attributes:
+        attempts: `picture` (its number in `attempt_pictures`), `x` and `y` (m), `success`.
+        steps: of the policy.
         navigation_steps: how many the policy has made while learning, wherever they led.
-        frames: how many have ever been added.
     """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self.frames = self.navigation_steps = 0
-        self.attempts = Table(frame=np.int64, cell=np.int64, success=bool)
-        self.steps = Table(frame=np.int64, next=np.int64, x_vel=np.float32, theta_vel=np.float32, success=bool)
-        self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)  # no memory until written to
-        self._open_step: dict[str, float] | None = None  # the last navigation step, until it is known where it led
-        self._first_attempt: int | None = None  # frame of the first attempt since then
+        self.navigation_steps = 0
+        self.attempts = Table(picture=np.int64, x=np.float32, y=np.float32, success=bool)
+        self.attempt_pictures, self.steps = Pictures(capacity), Steps(capacity, *VELOCITIES)
+        self._first_attempt: Picture | None = None  # before the first attempt since the last navigation step
 
     # --- Filling ------------------------------------------------------------------------------------------
-    def add(self, picture: NDArray[np.uint8], action: NDArray[np.float32], success: bool, phase: int) -> None:
+    def add(self, picture: Picture, action: NDArray[np.float32], success: bool, phase: int) -> None:
         """Take one frame, as `relmm.policies.learning.Learner.add` does."""
-        frame, self.frames = self.frames, self.frames + 1
-        self._pictures[frame % self.capacity] = picture
         x_vel, theta_vel, skill, x, y = (float(value) for value in action)
         if round(skill) == Skill.GRASP:
-            self.attempts.append(frame=frame, cell=xy_to_cell(x, y), success=success)
+            self.attempts.append(picture=self.attempt_pictures.add(picture), x=x, y=y, success=success)
             if success:
-                self._close_step(frame, success=True)
+                self._end_step(picture, success=True)
             elif self._first_attempt is None:
-                self._first_attempt = frame
+                self._first_attempt = picture
             return
-        self._close_step(frame)
+        self._end_step(picture)
         if round(skill) == Skill.NAVIGATE and phase != Phase.PSEUDO_RESET:
             self.navigation_steps += phase == Phase.LEARNING
-            self._open_step = {"frame": frame, "x_vel": x_vel, "theta_vel": theta_vel}
+            self.steps.begin(picture, x_vel=x_vel, theta_vel=theta_vel)
 
     def save_episode(self) -> None:
         """End the episode: what comes next need not follow on."""
         if self._first_attempt is not None:
-            self._close_step(self._first_attempt)
-        self._open_step = self._first_attempt = None
+            self._end_step(self._first_attempt)
+        self.steps.forget()
 
-    def _close_step(self, following: int, success: bool = False) -> None:
-        if self._open_step is not None:
-            self.steps.append(**self._open_step, next=following, success=success)
-        self._open_step = self._first_attempt = None
+    def _end_step(self, following: Picture, success: bool = False) -> None:
+        self.steps.end(following, success)
+        self._first_attempt = None
 
     # --- Reading ------------------------------------------------------------------------------------------
     @property
@@ -102,20 +166,9 @@ class Replay:
         successes = self.attempts["success"]
         return len(successes) - int(successes.argmax()) if successes.any() else 0
 
-    def pictures(self, frames: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """The pictures of frames, uint8 (n, 100, 100, 3)."""
-        return self._pictures[frames % self.capacity]
-
-    def available(self, table: Table) -> int:
-        """How many rows of one of the tables have pictures that are still there."""
-        return len(table) - self._first(table)
-
-    def sample(self, table: Table, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Such rows, uniformly, with replacement, (count,); there must be one."""
-        return rng.integers(self._first(table), len(table), count)
-
-    def _first(self, table: Table) -> int:
-        return int(np.searchsorted(table["frame"], self.frames - self.capacity))
+    def sample_attempts(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The newest rows, uniformly, with replacement, (count,); there must be one."""
+        return rng.integers(max(len(self.attempts) - self.capacity, 0), len(self.attempts), count)
 
 
 def to_pictures(pictures: NDArray[np.uint8], device: torch.device) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -98,11 +99,12 @@ def fill(numbered, action_of) -> Callable[..., Replay]:
     """A replay of a life, frame by frame."""
 
     def replay_of(life: list[str], capacity: int = 500) -> Replay:
-        replay = Replay(capacity)
+        replay, frames = Replay(capacity), itertools.count()
         for episode in life:
             for kind in episode:
+                frame = next(frames)
                 phase = Phase.PSEUDO_RESET if kind == "r" else Phase.LEARNING
-                replay.add(numbered(replay.frames), action_of(kind, replay.frames), kind == "s", phase)
+                replay.add(numbered(frame), action_of(kind, frame), kind == "s", phase)
             replay.save_episode()
         return replay
 
@@ -114,10 +116,10 @@ def live(numbered, action_of) -> Callable[..., None]:
     """Makes a learner take a life, frame by frame."""
 
     def take(learner: RelmmPaperLearner, life: str) -> None:
-        state = np.zeros(len(STATE_NAMES), np.float32)
+        state, frames = np.zeros(len(STATE_NAMES), np.float32), itertools.count()
         for episode in life.split():
             for kind in episode:
-                number = learner.replay.frames
+                number = next(frames)
                 phase = Phase.PSEUDO_RESET if kind == "r" else Phase.LEARNING
                 learner.add(numbered(number), state, action_of(kind, number), kind == "s", phase)
             learner.save_episode()

@@ -12,7 +12,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from relmm.errors import ConfigError
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
-PRESETS = ("paper", "paper_small")
+PRESETS = ("paper", "paper_small", "paper_continuous")
 
 PAPER: dict[str, Any] = {
     "camera": "paper",
@@ -20,6 +20,7 @@ PAPER: dict[str, Any] = {
     # 4.1, Appendix "Model Architectures": M = 6 networks of width 64, alpha = beta = 10, N_grasp = 2, rate 3e-4.
     "num_members": 6,
     "grasp_channels": 64,
+    "grasp_input_gain": 255.0,  # what the authors' code does to pixels
     "mean_weight": 10.0,
     "std_weight": 10.0,
     "num_grasp": 2,
@@ -40,7 +41,7 @@ PAPER: dict[str, Any] = {
     # 4.2 and the authors' SAC.
     "navigation_encoder": "paper",
     "navigation_hidden": 512,
-    "relabel": True,
+    "relabel": False,
     "navigation_learning_rate": 3e-4,
     "navigation_batch_size": 128,
     "navigation_updates": 1,
@@ -52,6 +53,16 @@ PAPER: dict[str, Any] = {
     "initial_temperature": 1.0,
 }
 SMALL = {"grasp_channels": 32, "grasp_batch_size": 64, "navigation_encoder": "paper_small", "navigation_batch_size": 64}
+
+
+# Appendix "Continuous grasping", as in the authors' code.
+CONTINUOUS = {
+    "grasping": "continuous",
+    "num_members": 2,
+    "grasp_learning_rate": 1e-4,
+    "grasp_batch_size": 256,
+    "min_attempts_to_update": 1000,
+}
 
 
 def preset(name: str) -> PreTrainedConfig:
@@ -68,7 +79,10 @@ def bad_values() -> list[tuple[str, float]]:
     return cases
 
 
-@pytest.mark.parametrize(("name", "wanted"), [("paper", PAPER), ("paper_small", {**PAPER, **SMALL})])
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [("paper", PAPER), ("paper_small", {**PAPER, **SMALL}), ("paper_continuous", {**PAPER, **CONTINUOUS})],
+)
 def test_preset_has_the_values_of_the_paper(name: str, wanted: dict[str, Any]) -> None:
     config = preset(name)
     assert isinstance(config, RelmmPaperConfig)
@@ -103,6 +117,7 @@ def test_limits_of_a_range_are_allowed(name: str) -> None:
     ("settings", "message"),
     [
         ({"navigation_encoder": "lidar"}, r"policy\.navigation_encoder is 'lidar': choose one of paper, paper_small"),
+        ({"navigation": "slam"}, r"policy\.navigation is 'slam': choose one of sac, random"),
         ({"camera": "webcam"}, "camera 'webcam': choose one of paper, d435"),
     ],
 )

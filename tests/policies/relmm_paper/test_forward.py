@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from relmm.errors import ConfigError
-from relmm.features import FPS, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phase, Skill
+from relmm.features import FPS, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phase, Skill, cell_to_xy
 from relmm.policies.relmm_paper.modeling_relmm_paper import RelmmPaperPolicy
 from relmm.policies.relmm_paper.navigation import NavigationBatch
 from relmm.policies.relmm_paper.replay import to_pictures
@@ -86,11 +86,11 @@ def steps_of(calls: list[tuple[Any, ...]]) -> list[NavigationBatch]:
     ],
 )
 def test_forward_learns_a_drive_as_the_replay_knows_it(
-    episode: str, after: int, success: bool, make_policy: MakePolicy, as_batch, shown, numbered, fill
+    episode: str, after: int, success: bool, make_policy: MakePolicy, as_batch, shown, numbered, number_of, fill
 ) -> None:
     """Its own row tells what the robot saw and did; those of the attempts after it, in any order, what came of it."""
     attempts = [frame for frame, kind in enumerate(episode) if kind in "fs"]
-    policy = make_policy(seed=1)
+    policy = make_policy(seed=1, relabel=True)
     seen = shown(policy)
     pictures = to_pictures(np.stack([numbered(0), numbered(after)]), CPU)
     chance = policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
@@ -104,8 +104,8 @@ def test_forward_learns_a_drive_as_the_replay_knows_it(
         assert batch.continues.item() == (not success)
     assert len(seen["navigation"]) == 2
     replay = fill([episode])
-    assert replay.steps["success"][0] == success
-    assert success or replay.steps["next"][0] == after
+    assert replay.steps.table["ended"][0] == success
+    assert success or number_of(replay.steps.pictures[replay.steps.table["next"][:1]][0]) == after
 
 
 @pytest.mark.parametrize("episode", ["d", "dfffd", "dfffs"])
@@ -121,7 +121,9 @@ def test_forward_learns_attempts_with_the_loss_of_the_ensemble(make_policy, as_b
     policy = make_policy(seed=1)
     loss, logs = policy.forward(as_batch("dffsp", [1, 3, 4]))
     pictures = to_pictures(np.stack([numbered(1), numbered(3)]), CPU)
-    wanted, wanted_logs = policy.grasping.loss(pictures, torch.tensor([1, 3]), torch.tensor([False, True]))
+    wanted, wanted_logs = policy.grasping.loss(
+        pictures, torch.from_numpy(cell_to_xy(np.array([1, 3]))), torch.tensor([False, True])
+    )
     assert loss.item() == pytest.approx(wanted.item())
     assert logs == pytest.approx(wanted_logs)
 
@@ -217,9 +219,9 @@ def test_stock_training_computes_the_losses_of_learning_online(make_policy) -> N
     navigation_loss, wanted = policy.navigation.loss(
         learner.navigation_batch(np.arange(count)), torch.randn(2, count, 2)
     )
-    pictures = to_pictures(replay.pictures(replay.attempts["frame"]), CPU)
-    cells, successes = (torch.from_numpy(replay.attempts[name]) for name in ("cell", "success"))
-    grasp_loss, grasp_logs = policy.grasping.loss(pictures, cells, successes)
+    pictures = to_pictures(replay.attempt_pictures[replay.attempts["picture"]], CPU)
+    x, y, successes = (torch.from_numpy(replay.attempts[name]) for name in ("x", "y", "success"))
+    grasp_loss, grasp_logs = policy.grasping.loss(pictures, torch.stack([x, y], dim=1), successes)
     assert successes.any()
     assert count > 20
     assert logs == pytest.approx({**grasp_logs, **wanted}, rel=1e-3)

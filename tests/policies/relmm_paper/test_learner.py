@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from relmm.features import FRONT, MAX_THETA_VEL, STATE_NAMES, Phase, Skill, action_dict
+from relmm.features import FRONT, MAX_THETA_VEL, STATE_NAMES, Phase, Skill, action_dict, cell_to_xy
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm_paper.learner import RelmmPaperLearner
 from relmm.policies.relmm_paper.replay import to_pictures
@@ -77,13 +77,13 @@ def test_pseudo_resets_teach_nothing(make_learner, count_steps) -> None:
 
 
 @pytest.mark.parametrize("life", ["dddd ffffffffffff", "ffff dddddddddddd"])
-def test_rows_that_are_all_overwritten_do_no_harm(life: str, make_learner, count_steps) -> None:
+def test_much_of_one_kind_pushes_out_nothing_of_the_other(life: str, make_learner, count_steps) -> None:
     """A long curriculum without a drive, or a long search without an attempt."""
     learner = make_learner(life, capacity=8)
     counts = count_steps(learner)
     learner.update_grasping(Phase.LEARNING)
     learner.update_navigation()
-    assert sorted(counts.values()) == [0, 1]
+    assert counts == {"grasping": 1, "navigation": 1}
 
 
 @pytest.mark.parametrize(
@@ -107,6 +107,14 @@ def test_recorded_frames_teach_as_if_they_had_just_happened(
     learner.read(recorded("rrdfdfdfdfs"), update=update)
     assert len(learner.replay.attempts) == 5
     assert counts == {"grasping": grasps, "navigation": drives}
+
+
+def test_random_navigation_has_nothing_to_learn(make_learner, count_steps) -> None:
+    learner = make_learner("dddddf", navigation="random", min_attempts_to_update=1)
+    counts = count_steps(learner)
+    learner.update_grasping(Phase.LEARNING)
+    learner.update_navigation()
+    assert counts == {"grasping": 1, "navigation": 0}
 
 
 # --- What it changes -----------------------------------------------------------------------------------------
@@ -149,11 +157,11 @@ def test_policy_is_told_what_there_was_to_learn_from(make_learner, live) -> None
 # --- Batches -------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("relabel", [False, True])
 def test_navigation_batch_is_that_of_its_frames(relabel: bool, make_learner, numbered) -> None:
-    learner = make_learner("dfdfs dfdss rrddd", relabel=relabel)
-    policy, steps = learner.policy, learner.replay.steps
-    batch = learner.navigation_batch(np.arange(len(steps)))
-    columns = (steps["frame"].tolist(), steps["next"].tolist(), steps["success"].tolist())
-    for row, (frame, after, success) in enumerate(zip(*columns, strict=True)):
+    policy = (learner := make_learner("dfdfs dfdss rrddd", relabel=relabel)).policy
+    batch = learner.navigation_batch(np.arange(5))
+    steps = [(0, 2, False), (2, 4, True), (5, 7, False), (7, 8, True), (12, 13, False)]
+    assert len(learner.replay.steps) >= len(steps)
+    for row, (frame, after, success) in enumerate(steps):
         pictures = to_pictures(np.stack([numbered(frame), numbered(after)]), CPU)
         chance = policy.grasping.grasp_probability(policy.grasping.estimate(pictures))[1].item()
         assert torch.equal(batch.pictures[row], pictures[0])
@@ -171,10 +179,12 @@ def test_frames_are_taken_as_recorders_take_them(make_learner, numbered) -> None
         learner.add_frame({FRONT: numbered(number), **dict.fromkeys(STATE_NAMES, 0.0)}, action, outcome, "task")
     learner.save_episode()
     replay = learner.replay
-    names = ("frame", "next", "x_vel", "theta_vel", "success")
-    assert [replay.steps[name].item() for name in names] == pytest.approx([0, 1, 0.1, -MAX_THETA_VEL / 2, True])
-    assert replay.attempts["cell"].tolist() == [17]
-    assert np.array_equal(replay.pictures(np.array([1]))[0], numbered(1))
+    names = ("x_vel", "theta_vel", "ended")
+    assert [replay.steps.table[name].item() for name in names] == pytest.approx([0.1, -MAX_THETA_VEL / 2, True])
+    assert [replay.attempts[name].item() for name in "xy"] == pytest.approx(cell_to_xy(17).tolist())
+    pictures = [replay.steps.pictures[replay.steps.table[name]] for name in ("picture", "next")]
+    pictures.append(replay.attempt_pictures[replay.attempts["picture"]])
+    assert all(np.array_equal(kept[0], numbered(n)) for kept, n in zip(pictures, (0, 1, 1), strict=True))
 
 
 # --- It learns -----------------------------------------------------------------------------------------------

@@ -11,7 +11,18 @@ import torch
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 from torch import Tensor
 
-from relmm.features import ACTION_NAMES, BASKET_XY, BELIEF, GRID, STATE_NAMES, Skill, cell_to_xy, xy_to_cell
+from relmm.features import (
+    ACTION_NAMES,
+    BASKET_XY,
+    BELIEF,
+    GRID,
+    MAX_THETA_VEL,
+    MAX_X_VEL,
+    STATE_NAMES,
+    Skill,
+    cell_to_xy,
+    xy_to_cell,
+)
 from relmm.policies.controller import Row
 from relmm.policies.relmm_paper.modeling_relmm_paper import RelmmPaperPolicy
 
@@ -101,6 +112,18 @@ def test_greedy_policy_is_deterministic(make_policy: MakePolicy, make_batch, emp
     first.reset()
     assert torch.equal(first.select_action(batch), actions)
     assert torch.equal(second.select_action(batch), actions)
+
+
+def test_random_navigation_drives_anywhere_and_grasps_as_ever(certain: MakePolicy, make_batch, empty) -> None:
+    """The paper's "Rand nav": the ensemble as it is, and uniform drives, also when nothing is sampled."""
+    drives = certain(0.3, navigation="random")
+    actions = torch.cat([drives.select_action(make_batch(empty)) for _ in range(400)])
+    assert not actions[:, 2].any()
+    for column, (low, high) in enumerate([(0, MAX_X_VEL), (-MAX_THETA_VEL, MAX_THETA_VEL)]):
+        share = np.sort((actions[:, column].numpy() - low) / (high - low))
+        assert np.abs(share - np.linspace(0, 1, 400)).max() < 0.1, "Kolmogorov and Smirnov: p < 0.001"
+    taken = skills(certain(0.7, navigation="random"), make_batch(empty), 6)
+    assert taken == [Skill.GRASP, Skill.GRASP, Skill.NAVIGATE] * 2
 
 
 # --- Sampling ------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, Skill
-from relmm.policies.relmm_paper.configuration_relmm_paper import NAVIGATION_ENCODERS
+from relmm.policies.relmm_paper.configuration_relmm_paper import CHOICES
 from relmm.policies.relmm_paper.navigation import (
     Actor,
     Critics,
@@ -105,7 +106,7 @@ def slope(function: Callable[[], Tensor], weights: list[Tensor], direction: list
 
 
 # --- Networks ------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", NAVIGATION_ENCODERS)
+@pytest.mark.parametrize("kind", CHOICES["navigation_encoder"])
 def test_features_have_the_promised_length(kind: str, noise_pictures) -> None:
     encoder = Encoder(kind)
     assert encoder(noise_pictures(2)).shape == (2, encoder.features)
@@ -165,6 +166,19 @@ def test_loss_is_the_sum_of_the_three_of_sac(make_navigation: MakeNavigation, ba
     assert loss.item() == pytest.approx(critics + actor + temperature)
     assert logs["temperature"] == pytest.approx(0.3)
     assert logs["entropy"] == pytest.approx(-act_at(navigation, batch.pictures, noise[0])[1].mean().item())
+
+
+def test_logs_tell_whether_pictures_matter(make_navigation: MakeNavigation, batch, noise) -> None:
+    navigation = make_navigation()
+    mean, log_std = navigation.actor(batch.pictures)
+    logs = navigation.loss(batch, noise)[1]
+    assert logs["actor_spread"] == pytest.approx(np.std(mean.tanh().tolist(), axis=0).mean(), rel=1e-4)
+    assert logs["actor_std"] == pytest.approx(log_std.exp().mean().item(), rel=1e-4)
+    values = navigation.critics(navigation.critics.encode(batch.pictures), batch.actions)
+    assert logs["value_spread"] == pytest.approx(np.std(values.tolist(), axis=1).mean(), rel=1e-4)
+    same = batch.pictures[:1].expand_as(batch.pictures)
+    logs = navigation.loss(dataclasses.replace(batch, pictures=same), noise)[1]
+    assert logs["actor_spread"] == pytest.approx(0, abs=1e-5)
 
 
 def test_each_part_learns_from_its_own_loss_alone(make_navigation: MakeNavigation, batch, noise) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from relmm.features import GRID, MAX_THETA_VEL, MAX_X_VEL, Phase
+from relmm.features import GRID, MAX_THETA_VEL, MAX_X_VEL, Phase, cell_to_xy
 from relmm.policies.relmm_paper.replay import Replay, Table, to_pictures
 
 Life = list[str]
@@ -50,9 +50,11 @@ def steps_of(life: Life) -> list[Step]:
     return steps
 
 
-def rows_of(table: Table) -> list[Step]:
-    columns = (table[name].tolist() for name in ("frame", "next", "success"))
-    return list(zip(*columns, strict=True))
+def rows_of(replay: Replay, number_of) -> list[Step]:
+    """The frames are told by their pictures."""
+    steps = replay.steps.table
+    before, after = ([number_of(image) for image in replay.steps.pictures[steps[name]]] for name in ("picture", "next"))
+    return list(zip(before, after, steps["ended"].tolist(), strict=True))
 
 
 # --- Transitions ---------------------------------------------------------------------------------------------
@@ -79,32 +81,33 @@ def rows_of(table: Table) -> list[Step]:
         (["dr", "rs"], [(0, 1, False)]),
     ],
 )
-def test_drive_leads_to_the_first_success_or_the_picture_after_its_attempts(life, expected, fill: Fill) -> None:
-    assert rows_of(fill(life).steps) == expected
+def test_drive_leads_to_the_first_success_or_the_picture_after_its_attempts(
+    life, expected, fill: Fill, number_of
+) -> None:
+    assert rows_of(fill(life), number_of) == expected
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_steps_of_any_life_are_those_of_the_slow_reference(seed: int, fill: Fill) -> None:
+def test_steps_of_any_life_are_those_of_the_slow_reference(seed: int, fill: Fill, number_of) -> None:
     life = random_life(seed)
     replay = fill(life)
-    assert rows_of(replay.steps) == steps_of(life)
+    assert rows_of(replay, number_of) == steps_of(life)
     frames = "".join(life)
     attempts = [index for index, kind in enumerate(frames) if kind in "fs"]
-    assert replay.attempts["frame"].tolist() == attempts
-    assert replay.attempts["cell"].tolist() == [frame % GRID**2 for frame in attempts]
+    pictures = replay.attempt_pictures[replay.attempts["picture"]]
+    assert [number_of(image) for image in pictures] == attempts
+    places = np.stack([replay.attempts[name] for name in "xy"], axis=1)
+    assert places == pytest.approx(cell_to_xy(np.array(attempts) % GRID**2), abs=1e-6)
     assert replay.attempts["success"].tolist() == [frames[frame] == "s" for frame in attempts]
-    assert (replay.frames, replay.navigation_steps) == (len(frames), frames.count("d"))
+    assert replay.navigation_steps == frames.count("d")
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_actions_and_pictures_are_those_of_their_frames(seed: int, fill: Fill, number_of) -> None:
+def test_actions_are_those_of_their_frames(seed: int, fill: Fill, number_of) -> None:
     replay = fill(random_life(seed))
-    share = replay.steps["frame"] % 1000 / 1000
-    assert replay.steps["x_vel"] == pytest.approx(share * MAX_X_VEL, abs=1e-6)
-    assert replay.steps["theta_vel"] == pytest.approx(share * MAX_THETA_VEL, abs=1e-4)
-    for column in ("frame", "next"):
-        frames = replay.steps[column]
-        assert [number_of(image) for image in replay.pictures(frames)] == frames.tolist()
+    share = np.array([frame % 1000 / 1000 for frame, _, _ in rows_of(replay, number_of)])
+    assert replay.steps.table["x_vel"] == pytest.approx(share * MAX_X_VEL, abs=1e-6)
+    assert replay.steps.table["theta_vel"] == pytest.approx(share * MAX_THETA_VEL, abs=1e-4)
 
 
 def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> None:
@@ -122,25 +125,38 @@ def test_attempts_are_counted_from_the_first_success_on(life: str, count: int, f
 
 
 # --- Ring ----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("capacity", [5, 17, 60])
+@pytest.mark.parametrize("capacity", [1, 5, 17, 60])
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_sampled_still_has_its_pictures(capacity: int, seed: int, fill: Fill, number_of) -> None:
-    replay = fill([*random_life(seed), "drdfs"], capacity)  # so that each table has rows
-    rng = np.random.default_rng(0)
-    for table in (replay.attempts, replay.steps):
-        rows = replay.sample(table, 600, rng)
-        alive = {int(frame) for frame in table["frame"] if frame >= replay.frames - capacity}
-        assert set(table["frame"][rows].tolist()) == alive
-        assert replay.available(table) == len(alive)
-        frames = table["frame"][rows[:50]]
-        assert [number_of(image) for image in replay.pictures(frames)] == frames.tolist()
-    after = replay.steps["next"][replay.sample(replay.steps, 50, rng)]
-    assert [number_of(image) for image in replay.pictures(after)] == after.tolist()
+def test_the_newest_rows_of_both_kinds_are_sampled_with_their_pictures(
+    capacity: int, seed: int, fill: Fill, number_of
+) -> None:
+    life = [*random_life(seed), "drdfs"]  # so that each table has rows
+    replay, rng, frames = fill(life, capacity), np.random.default_rng(0), "".join(life)
+    attempts = [index for index, kind in enumerate(frames) if kind in "fs"]
+    rows = replay.sample_attempts(600, rng)
+    pictures = replay.attempt_pictures[replay.attempts["picture"][rows]]
+    assert {number_of(image) for image in pictures} == set(attempts[-capacity:])
+    rows, steps = replay.steps.sample(600, rng), replay.steps.table
+    before, after = (replay.steps.pictures[steps[name][rows]] for name in ("picture", "next"))
+    seen = {(number_of(a), number_of(b), bool(c)) for a, b, c in zip(before, after, steps["ended"][rows], strict=True)}
+    assert seen == set(steps_of(life)[-capacity:])
+
+
+def test_neither_pseudo_resets_nor_attempts_push_out_navigation_steps(fill: Fill, number_of) -> None:
+    """With room for five frames alone, thirty of other kinds would leave nothing of two steps."""
+    replay = fill(["ddp", "r" * 30, "f" * 30], capacity=5)
+    assert rows_of(replay, number_of) == [(0, 1, False), (1, 2, False)]
+
+
+def test_picture_between_two_steps_is_kept_once(fill: Fill) -> None:
+    replay = fill(["dddd"])
+    assert replay.steps.table["picture"].tolist() == [0, 1, 2]
+    assert replay.steps.table["next"].tolist() == [1, 2, 3]
 
 
 def test_rows_are_sampled_uniformly(fill: Fill) -> None:
     replay = fill(["f" * 20])
-    counts = np.bincount(replay.sample(replay.attempts, 4000, np.random.default_rng(0)), minlength=20)
+    counts = np.bincount(replay.sample_attempts(4000, np.random.default_rng(0)), minlength=20)
     assert ((counts - 200) ** 2 / 200).sum() < 43.8  # chi-squared, 19 degrees of freedom: p = 0.001
 
 
