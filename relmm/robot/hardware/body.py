@@ -24,7 +24,7 @@ from relmm.robot.hardware.widowx import ArmState, WidowX
 logger = logging.getLogger(__name__)
 
 _SLICE_S = 0.02  # between looks at what may have gone wrong
-_MAX_LATE_S = 0.1  # that a wait makes up for
+_MAX_LATE_S, _LEAST_S = 0.1, 0.001  # that a wait makes up for, and that are worth a sleep
 _PAN, _TILT = 0.0, 0.825  # rad, as the authors had it
 _HEAD_S = 1.2
 _RECONNECT_S = 60.0  # to wait for a base whose cable is out
@@ -126,7 +126,7 @@ class LocobotBody:
         self._due += seconds + (late if late > _MAX_LATE_S else 0.0)
         try:
             self._watch()
-            while (left := self._due - clock.now()) > 0:
+            while (left := self._due - clock.now()) > _LEAST_S:
                 clock.sleep(min(left, _SLICE_S))
                 self._watch()
         except RobotError:

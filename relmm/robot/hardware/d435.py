@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from relmm.errors import RobotError
 from relmm.features import FloatArray
 from relmm.geometry import CameraGeometry
-from relmm.robot.hardware import clock
 
 WIDTH, HEIGHT, FPS = 640, 480, 30
 _SUPERSAMPLING = 4  # a picture of 100x100 is averaged from one four times as large
@@ -88,7 +87,7 @@ class D435:
 
     def _fresh(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
         """The first pictures that show nothing older than this call."""
-        earliest = time.perf_counter() + self._latency / clock.SPEED
+        earliest = time.perf_counter() + self._latency
         while True:
             taken, color, depth = self._camera.newest()
             if taken >= earliest and color is not None and depth is not None:

@@ -5,7 +5,7 @@ memory left) sends none. So bytes go through this process: it passes them on bot
 `SILENCE_S`, or the program is gone, it sends the frame that stops the base. It opens the port again when the cable
 comes back, and the first thing that it sends there is a stop.
 
-    python -m relmm.robot.hardware.guard PORT SOCKET_NUMBER SPEED
+    python -m relmm.robot.hardware.guard PORT SOCKET_NUMBER
 """
 
 from __future__ import annotations
@@ -35,11 +35,10 @@ class Guard:
     Args:
         port: the base's device.
         program: a socket whose other end is the robot's program.
-        speed: of the robot's time, see `clock.SPEED`.
     """
 
-    def __init__(self, port: str, program: socket.socket, speed: float) -> None:
-        self._port, self._program, self._speed = port, program, speed
+    def __init__(self, port: str, program: socket.socket) -> None:
+        self._port, self._program = port, program
         self._serial: serial.Serial | None = None
         self._opened = self._heard = self._stopped = float("-inf")  # when that happened last, s
 
@@ -52,12 +51,12 @@ class Guard:
         finally:
             for _ in range(_LAST_STOPS):
                 self._write(STOP)
-                time.sleep(PERIOD_S / self._speed)
+                time.sleep(PERIOD_S)
 
     def _pass_on(self) -> bool:
         """Wait for bytes and hand them over; whether the program is still there."""
         self._open()
-        ready, _, _ = select.select([self._program, *self._open_ports()], [], [], PERIOD_S / self._speed)
+        ready, _, _ = select.select([self._program, *self._open_ports()], [], [], PERIOD_S)
         for source in ready:
             if source is self._program:
                 data = self._program.recv(_CHUNK)
@@ -71,8 +70,8 @@ class Guard:
 
     def _stop_in_silence(self) -> None:
         now = time.monotonic()
-        silent = now - self._heard > SILENCE_S / self._speed
-        if silent and now - self._stopped > PERIOD_S / self._speed:
+        silent = now - self._heard > SILENCE_S
+        if silent and now - self._stopped > PERIOD_S:
             self._write(STOP)
             self._stopped = now
 
@@ -122,13 +121,13 @@ class Guard:
 def main() -> None:
     """Entry point of the process."""
     # The program decides when it ends: Ctrl-C and a lost terminal are for it, and its end is seen at the socket.
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGTSTP):
-        signal.signal(number, signal.SIG_IGN)
-    port, number_of_socket, speed = sys.argv[1:]
-    with socket.socket(fileno=int(number_of_socket)) as program:
+    for ignored in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGTSTP):
+        signal.signal(ignored, signal.SIG_IGN)
+    port, number = sys.argv[1:]
+    with socket.socket(fileno=int(number)) as program:
         # A program that was killed while bytes were under way resets the socket instead of closing it.
         with contextlib.suppress(ConnectionError):
-            Guard(port, program, float(speed)).run()
+            Guard(port, program).run()
 
 
 if __name__ == "__main__":

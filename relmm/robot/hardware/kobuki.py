@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import socket
 import subprocess
 import sys
@@ -168,7 +169,7 @@ class Kobuki:
     def _run(self) -> None:
         due = clock.now()
         while self._open:
-            self._program.settimeout(max(due - clock.now(), 1e-4) / clock.SPEED)
+            self._program.settimeout(min(max(due - clock.now(), 1e-3), PERIOD_S))
             try:
                 data = self._program.recv(_CHUNK)
             except TimeoutError:
@@ -180,7 +181,8 @@ class Kobuki:
             with self._lock:
                 for payload in self._reader.feed(data or b""):
                     self._take(decode(payload))
-                if clock.now() >= due and self._open:
+                # Also when nothing has come: the guard takes silence for the end of this program.
+                if (clock.now() >= due or data is None) and self._open:
                     due = clock.now() + PERIOD_S
                     self._approach_goal()
                     self._send_command()
@@ -238,7 +240,7 @@ class Kobuki:
             return
         moving = self._velocity != (0.0, 0.0)
         lights = _STOPPED if self._blocked else _DRIVING if moving else _STANDING
-        command = frame(base_control(self._velocity[0], _radians(self._velocity[1])), general_output(lights), *self._extra)
+        command = frame(base_control(self._velocity[0], math.radians(self._velocity[1])), general_output(lights), *self._extra)
         try:
             self._program.send(command)
             self._extra.clear()
@@ -249,7 +251,7 @@ class Kobuki:
     def _start_guard(self) -> tuple[socket.socket, subprocess.Popen[bytes]]:
         program, other = socket.socketpair()
         number = other.fileno()
-        words = [sys.executable, "-m", "relmm.robot.hardware.guard", self.port, str(number), str(clock.SPEED)]
+        words = [sys.executable, "-m", "relmm.robot.hardware.guard", self.port, str(number)]
         # In a session of its own: Ctrl-C and Ctrl-Z in the terminal reach the program only.
         guard = subprocess.Popen(words, pass_fds=[number], stdin=subprocess.DEVNULL, start_new_session=True)
         other.close()
@@ -267,10 +269,3 @@ class Kobuki:
 
 def _clamp(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
-
-
-def _radians(degrees: float) -> float:
-    return degrees * 0.017453292519943295
-
-
-

@@ -174,12 +174,16 @@ class DynamixelEmulator:
     Args:
         path: where the link to its device goes.
         motors: by id.
-        speed: of its time against ours.
+        now: its time, s.
         moves: whether the motors move by themselves; False if something else moves the joints.
     """
 
     def __init__(
-        self, path: Path, motors: dict[int, Motor] | None = None, speed: float = 1.0, moves: bool = True
+        self,
+        path: Path,
+        motors: dict[int, Motor] | None = None,
+        now: Callable[[], float] = time.monotonic,
+        moves: bool = True,
     ) -> None:
         self.cable = Cable(path)
         self.motors = motors or locobot_motors()
@@ -188,14 +192,11 @@ class DynamixelEmulator:
         self.log: list[tuple[int, int, bytes]] = []  # (id, address, data) of what was written
         self.lock = threading.Lock()
         self._pending = bytearray()
-        self._speed, self._moves, self._last = speed, moves, 0.0
+        self.now, self._moves = now, moves
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._last = self.now()
         self._thread.start()
-
-    def now(self) -> float:
-        return time.monotonic() * self._speed
 
     def _run(self) -> None:
         while not self._stop.is_set():

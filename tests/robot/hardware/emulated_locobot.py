@@ -2,7 +2,8 @@
 
     python emulated_locobot.py FOLDER ROOM NUM_OBJECTS SEED SPEED
 
-FOLDER then holds `kobuki`, `dxl` and `camera`. It lives until its standard input ends.
+FOLDER then holds `kobuki`, `dxl`, `camera` and `time`. With SPEED 0 time passes only while the program that drives it
+sleeps, see `emulated_time.py`. It lives until its standard input ends.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from dynamixel_emulator import GOAL_PWM, DynamixelEmulator, locobot_motors
+from emulated_time import SharedTime
 from kobuki_emulator import KobukiEmulator
 
 from relmm.geometry import CAMERAS, CameraGeometry
@@ -30,6 +32,7 @@ from pyrealsense2 import INTRINSICS
 
 PERIOD_S = 0.02
 WHEEL_RADIUS = 0.035
+_STILL_S = 0.004
 ARM_IDS = (1, 2, 4, 5, 6)
 
 
@@ -51,7 +54,7 @@ class EmulatedLocobot:
         room: name of the simulated room.
         num_objects: in it.
         seed: of it.
-        speed: of its time against ours.
+        speed: of its time against ours; 0 to let it pass while the program that drives it sleeps.
     """
 
     def __init__(self, folder: Path, room: str, num_objects: int, seed: int, speed: float) -> None:
@@ -61,9 +64,10 @@ class EmulatedLocobot:
         self._heading = self.body.truth.robot()[2]
         self._turned = 0.0
         self._gripper_pwm = 0
+        self.time = SharedTime(folder / "time")
         motors = locobot_motors()
-        self.base = KobukiEmulator(folder / "kobuki", plant=self, speed=speed, threaded=False)
-        self.chain = DynamixelEmulator(folder / "dxl", motors, speed=speed, moves=False)
+        self.base = KobukiEmulator(folder / "kobuki", plant=self, threaded=False)
+        self.chain = DynamixelEmulator(folder / "dxl", motors, now=self.time.now, moves=False)
         self._publish()
         self._wanted: queue.SimpleQueue[Connection] = queue.SimpleQueue()
         self._listener = Listener(str(folder / "camera"), "AF_UNIX")
@@ -72,10 +76,22 @@ class EmulatedLocobot:
     def run(self, stopped: threading.Event) -> None:
         due = time.monotonic()
         while not stopped.is_set():
-            self.base.tick()
-            self._show_pictures()
-            due = max(due + PERIOD_S / self.speed, time.monotonic() - 0.2)
-            time.sleep(max(due - time.monotonic(), 0.0))
+            if self.speed:
+                self._tick()
+                self._show_pictures()
+                due = max(due + PERIOD_S / self.speed, time.monotonic() - 0.2)
+                time.sleep(max(due - time.monotonic(), 0.0))
+            elif self.time.now() + 1e-9 < self.time.allowed():
+                self._tick()
+                due = time.monotonic()
+            else:
+                time.sleep(0.0002)
+                if time.monotonic() > due + _STILL_S:  # the program is at work: perhaps it waits for a picture
+                    self._show_pictures()
+
+    def _tick(self) -> None:
+        self.base.tick()
+        self.time.advance(PERIOD_S)
 
     # --- What the base moves -----------------------------------------------------------------------------
     def step(self, seconds: float, x_vel: float, theta_vel: float) -> None:

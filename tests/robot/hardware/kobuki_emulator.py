@@ -72,11 +72,10 @@ class KobukiEmulator:
     Args:
         path: where the link to its device goes.
         plant: what it moves.
-        speed: of its time against ours.
         threaded: False if `tick` is called from elsewhere.
     """
 
-    def __init__(self, path: Path, plant: Plant | None = None, speed: float = 1.0, threaded: bool = True) -> None:
+    def __init__(self, path: Path, plant: Plant | None = None, threaded: bool = True) -> None:
         self.plant: Plant = plant or RollingBase()
         self.cable = Cable(path)
         self.battery = 16.0  # V
@@ -94,7 +93,6 @@ class KobukiEmulator:
         self._timestamp = 0
         self._asked = False
         self._stop = threading.Event()
-        self._speed = speed
         self._thread = threading.Thread(target=self._run, daemon=True) if threaded else None
         if self._thread is not None:
             self._thread.start()
@@ -173,7 +171,7 @@ class KobukiEmulator:
         due = time.monotonic()
         while not self._stop.is_set():
             self.tick()
-            due += PERIOD_S / self._speed
+            due += PERIOD_S
             time.sleep(max(due - time.monotonic(), 0))
 
     # --- Faults ------------------------------------------------------------------------------------------
