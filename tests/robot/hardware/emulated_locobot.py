@@ -32,7 +32,7 @@ from pyrealsense2 import INTRINSICS
 
 PERIOD_S = 0.02
 WHEEL_RADIUS = 0.035
-_STILL_S = 0.004
+_STILL_S, _PATIENCE_S = 0.004, 0.1
 ARM_IDS = (1, 2, 4, 5, 6)
 
 
@@ -90,8 +90,18 @@ class EmulatedLocobot:
                     self._show_pictures()
 
     def _tick(self) -> None:
-        self.base.tick()
         self.time.advance(PERIOD_S)
+        heard = len(self.base.commands)
+        self.base.tick()
+        if not self.speed:
+            self._wait_for_command(heard)
+
+    def _wait_for_command(self, heard: int) -> None:
+        """A real driver answers long before the next 20 ms are over; this one may be kept waiting by the machine."""
+        until = time.monotonic() + _PATIENCE_S
+        while len(self.base.commands) == heard and time.monotonic() < until:
+            time.sleep(0.0002)
+            self.base.receive()
 
     # --- What the base moves -----------------------------------------------------------------------------
     def step(self, seconds: float, x_vel: float, theta_vel: float) -> None:
