@@ -160,7 +160,8 @@ class ContactDetector:
     """Says whether a moving arm meets resistance: it lags behind its goal, or pushes the standing base away.
 
     A servo trails its moving goal by some hundredths of a second, so the plain difference of the two says more about
-    its speed than about what stops it. Made for one motion; ask it at every look, which are as far apart as the lag.
+    its speed than about what stops it. A joint that nothing stops is where its goal was at the last look, or on its way
+    to where it is now: looks at a real robot are not evenly spaced. Made for one motion; ask it at every look.
 
     Args:
         start: the sensors before the motion.
@@ -171,7 +172,8 @@ class ContactDetector:
 
     def touches(self, state: BodyState) -> bool:
         """Whether something stops the arm; `state` is the sensors now."""
-        lag = float(np.abs(state.joints - self._goal).max())
+        goals = self._goal, state.joint_goal
+        lag = float(np.abs(state.joints - np.clip(state.joints, np.minimum(*goals), np.maximum(*goals))).max())
         self._goal = state.joint_goal
         shove, swivel = self._start.travelled - state.travelled, state.heading - self._start.heading
         return lag > _MAX_LAG or shove > _MAX_SHOVE or abs(swivel) > _MAX_SWIVEL

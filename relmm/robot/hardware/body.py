@@ -1,0 +1,188 @@
+"""The real LoCoBot's body: base, arm and camera as one `relmm.robot.body.Body`."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relmm.errors import RobotError
+from relmm.features import FloatArray
+from relmm.geometry import CameraGeometry
+from relmm.robot.body import BodyState
+from relmm.robot.hardware import clock
+from relmm.robot.hardware.calibration import Calibration
+from relmm.robot.hardware.d435 import D435
+from relmm.robot.hardware.kobuki import Kobuki
+from relmm.robot.hardware.kobuki_protocol import BATTERY_LOW, Sound
+from relmm.robot.hardware.widowx import ArmState, WidowX
+
+logger = logging.getLogger(__name__)
+
+_SLICE_S = 0.02  # between looks at what may have gone wrong
+_MAX_LATE_S, _LEAST_S = 0.1, 0.001  # that a wait makes up for, and that are worth a sleep
+_PAN, _TILT = 0.0, 0.825  # rad, as the authors had it
+_HEAD_S = 1.2
+_RECONNECT_S = 60.0  # to wait for a base whose cable is out
+
+
+class LocobotBody:
+    """See `relmm.robot.body.Body`; its time is the clock's.
+
+    Args:
+        base: driver of the base.
+        arm: driver of the arm.
+        camera: driver of the camera.
+        view: how pictures look; its position is where the camera really is.
+        calibration: of this robot.
+        say: shows what it would do, in a dry run; None for a robot that does it.
+    """
+
+    def __init__(
+        self,
+        base: Kobuki,
+        arm: WidowX,
+        camera: D435,
+        view: CameraGeometry,
+        calibration: Calibration,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        self.base, self.arm, self.eye = base, arm, camera
+        self.camera = replace(view, position=(*view.position[:2], calibration.camera_height))
+        self._say = say
+        self._start = self._due = clock.now()  # `_due`: when the last wait was to end
+        self._arm_state: tuple[float, ArmState] | None = None
+
+    def start(self) -> None:
+        """Check everything, take hold of the arm, and look at the floor.
+
+        Raises:
+            RobotError: something is wrong; says what to do.
+        """
+        self.base.wait_until_there()
+        battery = self.base.state().battery
+        if battery < BATTERY_LOW:
+            raise RobotError(
+                f"The battery is at {battery:.1f} V, and {BATTERY_LOW} V are needed to begin: charge it first."
+            )
+        self.base.play(Sound.ON)
+        self.arm.configure()
+        self.arm.look(_PAN, _TILT)
+        self.wait(_HEAD_S)
+
+    # --- Body --------------------------------------------------------------------------------------------
+    def drive(self, x_vel: float, theta_vel: float) -> None:
+        """See `Body.drive`; without another command the base stops after 0.5 s."""
+        self._tell(f"drive at {x_vel:.2f} m/s, turn at {theta_vel:.0f} deg/s")
+        self._due = clock.now()
+        self.base.drive(x_vel, theta_vel)
+
+    def move_arm(self, joints: FloatArray, seconds: float) -> None:
+        """See `Body.move_arm`.
+
+        Raises:
+            RobotError: the way there is not free of the robot itself or the floor.
+        """
+        self._tell(f"move the arm to {np.degrees(joints).round().tolist()} degrees in {seconds:.1f} s")
+        self._arm_state = None
+        self.arm.move(joints, seconds)
+        self._due = clock.now()
+
+    def set_gripper(self, opening: float) -> None:
+        """See `Body.set_gripper`."""
+        self._tell(f"move the fingers to {opening * 1000:.0f} mm" if opening >= 0 else "close the fingers")
+        self.arm.set_gripper(opening)
+
+    def state(self) -> BodyState:
+        """See `Body.state`."""
+        base, arm = self.base.state(), self._read_arm()
+        return BodyState(
+            time=clock.now() - self._start,
+            travelled=base.travelled,
+            heading=base.heading,
+            joints=arm.joints,
+            joint_goal=arm.goal,
+            gripper=max(arm.opening, 0.0),
+            bumper=base.bumped,
+        )
+
+    def capture(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """See `Body.capture`."""
+        return self.eye.capture()
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, and watch base, arm, gripper and camera meanwhile.
+
+        Raises:
+            RobotError: one of them is lost or broken; the base stands still then.
+        """
+        self.base.forget_bumps()
+        # From the end of the last wait on, so that a row of waits takes no longer than it says; reading takes time too.
+        late = clock.now() - self._due
+        self._due += seconds + (late if late > _MAX_LATE_S else 0.0)
+        try:
+            self._watch()
+            while (left := self._due - clock.now()) > _LEAST_S:
+                clock.sleep(min(left, _SLICE_S))
+                self._watch()
+        except RobotError:
+            self.base.stop()
+            self.base.play(Sound.ERROR)
+            raise
+        self._arm_state = None
+
+    def stop(self) -> None:
+        """See `Body.stop`."""
+        self.base.stop()
+        self._arm_state = None
+        self.arm.hold()
+
+    def close(self) -> None:
+        """Stop the base, lay the arm down, and let go of all three, whatever state they are in."""
+        self.base.stop()
+        with contextlib.ExitStack() as stack:  # each of them, even if another one fails
+            stack.callback(self.base.close)
+            stack.callback(self.arm.close)
+            stack.callback(self.eye.close)
+            try:
+                self.arm.lie_down(clock.sleep)
+            except RobotError as error:
+                logger.warning("The arm was not laid down: %s", error)
+
+    # --- Watching ----------------------------------------------------------------------------------------
+    def _watch(self) -> None:
+        if not self.base.alive:
+            self._wait_for_base()
+        if not self.eye.alive:
+            raise RobotError("The camera sends no pictures: check its cable, and that it is plugged into USB 3.")
+        self.arm.check_health()
+        self.arm.update()
+
+    def _wait_for_base(self) -> None:
+        """The driver opens the port again by itself, and stops the base first.
+
+        Raises:
+            RobotError: it did not come back.
+        """
+        logger.warning("The base on %s is silent: check its cable and its switch. The robot waits.", self.base.port)
+        until = clock.now() + _RECONNECT_S
+        while not self.base.alive:
+            if clock.now() > until:
+                raise RobotError(f"The base on {self.base.port} has been silent for {_RECONNECT_S:.0f} s: start again.")
+            clock.sleep(_SLICE_S)
+        logger.warning("The base is back.")
+
+    def _read_arm(self) -> ArmState:
+        """The arm now; several looks at one moment ask its motors once."""
+        now = clock.now()
+        if self._arm_state is None or now - self._arm_state[0] > _SLICE_S / 2:
+            self._arm_state = (now, self.arm.state())
+        return self._arm_state[1]
+
+    def _tell(self, what: str) -> None:
+        if self._say is not None:
+            self._say(what)

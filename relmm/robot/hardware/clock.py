@@ -1,0 +1,15 @@
+"""The time that a robot lives in. An emulated robot may have another than ours: its tests replace these two."""
+
+from __future__ import annotations
+
+import time
+
+
+def now() -> float:
+    """s since some moment."""
+    return time.monotonic()
+
+
+def sleep(seconds: float) -> None:
+    """Let the robot's time pass."""
+    time.sleep(max(seconds, 0.0))

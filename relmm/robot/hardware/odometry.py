@@ -1,0 +1,54 @@
+"""Where a Kobuki has driven, by its wheels and its gyro."""
+
+from __future__ import annotations
+
+import math
+
+from relmm.robot.hardware.kobuki_protocol import M_PER_TICK, WHEELBASE, Feedback
+
+_TURN = 65_536  # at which encoders wrap
+_STILL_RATE = 1.0  # deg/s; what the gyro tells of a standing robot is less, and would add up
+
+
+class Odometry:
+    """Adds up encoder ticks and gyro angles, which wrap.
+
+    The gyro tells turns: wheels slip. While nothing moves its drift is left out.
+
+    Args:
+        wheel_scale: true distance by the one that the encoders tell, from the calibration.
+
+    Attributes:
+        travelled: m since the first feedback; backwards counts negative.
+        heading: degrees since then, positive = left, not wrapped.
+    """
+
+    def __init__(self, wheel_scale: float = 1.0) -> None:
+        self._m_per_tick = M_PER_TICK * wheel_scale
+        self._last: Feedback | None = None
+        self.travelled = 0.0
+        self.heading = 0.0
+
+    def update(self, feedback: Feedback) -> None:
+        """Take in one reading of the base."""
+        last, self._last = self._last, feedback
+        if last is None:
+            return
+        left, right = (
+            wrapped(now - before, _TURN) * self._m_per_tick
+            for now, before in ((feedback.left, last.left), (feedback.right, last.right))
+        )
+        self.travelled += (left + right) / 2
+        if feedback.angle is None or last.angle is None:
+            self.heading += math.degrees((right - left) / WHEELBASE)
+        elif left or right or abs(feedback.rate or 0.0) > _STILL_RATE:
+            self.heading += wrapped(feedback.angle - last.angle, 360.0)
+
+    def forget_position(self) -> None:
+        """Go on from the next reading: the base was switched off, and its counters begin anew."""
+        self._last = None
+
+
+def wrapped(difference: float, turn: float) -> float:
+    """The smallest difference that a counter which wraps at `turn` may mean."""
+    return (difference + turn / 2) % turn - turn / 2
