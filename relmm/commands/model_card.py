@@ -75,10 +75,20 @@ def model_card(facts: ModelFacts) -> ModelCard:
     return ModelCard("\n\n".join(sections) + "\n", ignore_metadata_errors=False)
 
 
-_NAVIGATION = {
-    "relmm": "ways to where it would are planned over the floor that it remembers",
-    "relmm_paper": "soft actor-critic navigates to where it would",
+_ENSEMBLE = "an ensemble of networks says where a grasp would succeed, a gate decides whether to try, and"
+_METHODS = {
+    "relmm": f"{_ENSEMBLE} ways to where it would are planned over the floor that it remembers",
+    "relmm_paper": f"{_ENSEMBLE} soft actor-critic navigates to where it would",
+    "relmm_single": "one soft actor-critic decides at every step whether to drive or to grasp, and where (the paper's "
+    "ablation of its hierarchy)",
 }
+
+
+def _method(policy: dict[str, Any]) -> str:
+    """How a policy works; baselines are named as such."""
+    if policy.get("navigation") == "random":
+        return f"{_ENSEMBLE} it drives about at random (the paper's baseline Rand nav)"
+    return _METHODS[policy["type"]]
 
 
 def _head(facts: ModelFacts) -> str:
@@ -86,9 +96,8 @@ def _head(facts: ModelFacts) -> str:
     return f"""# {facts.repo_id}
 
 A policy `{kind}` that drives a LoCoBot about a room and picks things up, learned online from scratch with `relmm`, a
-[LeRobot](https://github.com/huggingface/lerobot) package of ReLMM: an ensemble of networks says where a grasp would
-succeed, a gate decides whether to try, and {_NAVIGATION[kind]}. Rewards come from the
-robot's own sensors; no demonstrations, no reset, no map is given."""
+[LeRobot](https://github.com/huggingface/lerobot) package of ReLMM: {_method(facts.settings["policy"])}.
+Rewards come from the robot's own sensors; no demonstrations, no reset, no map is given."""
 
 
 def _room(settings: dict[str, Any]) -> str:

@@ -16,8 +16,8 @@ relmm-train: a robot is put into a room and learns to clean it.
 
   --robot.room=NAME             no_obstacles, obstacles, diverse, obstacles_rugs
   --robot.num_objects=N         that lie about
-  --policy.type=relmm           or relmm_paper: the paper's networks and soft actor-critic
-  --config_path=paper           or paper_small: relmm_paper with the paper's numbers, or smaller; or a file
+  --policy.type=relmm           or relmm_paper: the paper's networks and soft actor-critic; or relmm_single
+  --config_path=paper           or paper_small, paper_continuous: relmm_paper with the paper's numbers; or a file
   --policy.path=DIR             or user/repo[@revision]: go on from its weights
   --policy.device=cpu           or cuda, mps
   --curriculum.type=stationary  or autonomous, none

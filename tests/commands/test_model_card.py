@@ -83,10 +83,16 @@ def test_room_camera_and_commands(settings, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "words"), [("relmm", "planned over the floor"), ("relmm_paper", "soft actor-critic navigates")]
+    ("kind", "more", "words"),
+    [
+        ("relmm", {}, "planned over the floor"),
+        ("relmm_paper", {}, "soft actor-critic navigates"),
+        ("relmm_paper", {"navigation": "random"}, "drives about at random (the paper's baseline Rand nav)"),
+        ("relmm_single", {}, "one soft actor-critic decides at every step"),
+    ],
 )
-def test_it_says_how_its_policy_navigates(settings, tmp_path, kind, words):
-    text = card_of(settings | {"policy": settings["policy"] | {"type": kind}}, tmp_path).text
+def test_it_says_how_its_policy_navigates(settings, tmp_path, kind, more, words):
+    text = card_of(settings | {"policy": settings["policy"] | {"type": kind} | more}, tmp_path).text
     assert f"A policy `{kind}` that drives" in text
     assert words in text
     assert f"{len(STATE_NAMES)} numbers" in text

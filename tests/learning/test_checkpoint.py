@@ -26,6 +26,7 @@ from relmm.learning.untrusted import check_policy_folder
 from relmm.policies.learning import Learner, LearningConfig
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
+from relmm.policies.relmm_single.configuration_relmm_single import RelmmSingleConfig
 
 LITTLE = {"device": "cpu", "num_members": 2, "min_attempts_to_update": 1}
 SMALL = {**LITTLE, "channels": 4, "batch_size": 4}
@@ -40,10 +41,21 @@ PAPER = {
 }
 
 
+SINGLE: dict[str, object] = {
+    "device": "cpu",
+    "encoder": "paper_small",
+    "hidden": 8,
+    "batch_size": 4,
+    "min_steps_to_update": 2,
+}
+
+
 def make_config(kind: str, **settings) -> LearningConfig:
     if kind == "relmm":
         return ReLMMConfig(**{**SMALL, **settings})
-    return RelmmPaperConfig(**{**PAPER, **settings})
+    if kind == "relmm_single":
+        return RelmmSingleConfig(**{**SINGLE, **settings})
+    return RelmmPaperConfig(**{**PAPER, **settings, **({"perturbation": "novelty"} if kind == "novelty" else {})})
 
 
 def make_learner(kind: str = "relmm", seed: int = 0):
@@ -55,6 +67,10 @@ def make_learner(kind: str = "relmm", seed: int = 0):
         skill = Skill.GRASP if number % 2 else Skill.NAVIGATE
         action = np.array([0.2, 30.0, skill, 0.35, 0.0], np.float32)
         learner.add(picture, np.zeros(len(STATE_NAMES), np.float32), action, number % 4 == 1, Phase.LEARNING)
+    for picture in pictures[:4]:
+        learner.add(
+            picture, np.zeros(len(STATE_NAMES), np.float32), np.float32([0.2, 30, 0, 0, 0]), False, Phase.PSEUDO_RESET
+        )
     return actor, learner
 
 
@@ -62,10 +78,12 @@ def work(learner: Learner, times: int) -> None:
     for _ in range(times):
         learner.update_grasping(Phase.LEARNING)
         learner.update_navigation()
+        learner.update_pseudo_reset()
 
 
-@pytest.mark.parametrize("kind", ["relmm", "relmm_paper"])
-def test_restored_learner_goes_on_as_if_nothing_had_happened(tmp_path, kind):
+@pytest.mark.parametrize("kind", ["relmm", "relmm_paper", "novelty", "relmm_single"])
+def test_restored_learner_goes_on_as_if_nothing_had_happened(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr("relmm.policies.relmm_paper.learner.MIN_PERTURBATION_STEPS", 2)
     actor, learner = make_learner(kind)
     rng = np.random.default_rng(5)
     work(learner, 2)

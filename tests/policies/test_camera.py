@@ -12,7 +12,7 @@ from relmm.features import dataset_features
 from relmm.geometry import camera_info
 
 
-@pytest.mark.parametrize("kind", ["relmm", "relmm_paper", "relmm_scripted"])
+@pytest.mark.parametrize("kind", ["relmm", "relmm_paper", "relmm_single", "relmm_scripted"])
 def test_a_dataset_of_another_camera_is_refused_in_lerobots_own_commands(kind: str) -> None:
     """LeRobot makes a policy with the dataset's metadata."""
     meta = SimpleNamespace(features=dataset_features(camera=camera_info("d435")), stats={})
