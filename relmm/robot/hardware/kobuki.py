@@ -16,7 +16,6 @@ from relmm.robot.hardware import clock
 from relmm.robot.hardware.kobuki_protocol import (
     BATTERY_FULL,
     PERIOD_S,
-    STOP,
     Feedback,
     FrameReader,
     Output,
@@ -82,7 +81,7 @@ class Kobuki:
     Args:
         port: its device.
         wheel_scale: true distance by the one its encoders tell.
-        dry: only listen; nothing is sent.
+        dry: the base is told to stand still, whatever it should do.
     """
 
     def __init__(self, port: str, wheel_scale: float = 1.0, dry: bool = False) -> None:
@@ -110,10 +109,17 @@ class Kobuki:
         while self.state().packets == 0:
             if clock.now() > until:
                 raise RobotError(
-                    f"The base does not answer on {self.port}: switch it on, plug it in, or say another --robot.base_port "
-                    "(relmm-doctor --robot.type=locobot looks for it)."
+                    f"The base does not answer on {self.port}: switch it on, plug it in, or say another "
+                    "--robot.base_port (relmm-doctor --robot.type=locobot looks for it)."
                 )
             clock.sleep(PERIOD_S)
+
+    def firmware(self) -> tuple[int, int, int] | None:
+        """Version of its firmware, which it was asked for; None if it does not tell within a second."""
+        until = clock.now() + 1.0
+        while self.state().firmware is None and clock.now() < until:
+            clock.sleep(PERIOD_S)
+        return self.state().firmware
 
     def state(self) -> BaseState:
         """What it told last."""
@@ -236,11 +242,10 @@ class Kobuki:
         self._goal = self._velocity = (0.0, 0.0)
 
     def _send_command(self) -> None:
-        if self._dry:
-            return
         moving = self._velocity != (0.0, 0.0)
         lights = _STOPPED if self._blocked else _DRIVING if moving else _STANDING
-        command = frame(base_control(self._velocity[0], math.radians(self._velocity[1])), general_output(lights), *self._extra)
+        control = base_control(self._velocity[0], math.radians(self._velocity[1]))
+        command = frame(base_control(0.0, 0.0) if self._dry else control, general_output(lights), *self._extra)
         try:
             self._program.send(command)
             self._extra.clear()

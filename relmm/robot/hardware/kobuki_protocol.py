@@ -120,7 +120,6 @@ def request_versions() -> bytes:
     return _sub_payload(Command.REQUEST_EXTRA, struct.pack("<H", 0x01 | 0x02 | 0x08))
 
 
-
 def velocity(control: bytes) -> tuple[float, float]:
     """What a base makes of the data of `base_control`: m/s and rad/s."""
     speed, radius = (value / 1000.0 for value in struct.unpack("<hh", control))
@@ -225,8 +224,8 @@ class FrameReader:
                 start += 1  # a header may follow in what was taken for a frame
             elif end >= len(buffer):
                 break
-            elif _checksum(buffer[start + 2 : end]) == buffer[end] and _is_tiled(payload := bytes(buffer[start + 3 : end])):
-                yield payload
+            elif _is_frame(buffer[start + 2 : end + 1]):
+                yield bytes(buffer[start + 3 : end])
                 start = end + 1
             else:
                 start += 1
@@ -234,8 +233,13 @@ class FrameReader:
         del buffer[: start if start >= 0 else len(buffer) - buffer.endswith(_HEADER[:1])]
 
 
-def _is_tiled(payload: bytes) -> bool:
-    """Whether sub-payloads fill a payload exactly. The check sum alone lets every 256th piece of noise through."""
+def _is_frame(body: bytearray) -> bool:
+    """Whether length, payload and check sum fit together. The sum alone lets every 256th piece of noise through."""
+    return _checksum(body[:-1]) == body[-1] and _is_tiled(body[1:-1])
+
+
+def _is_tiled(payload: bytearray) -> bool:
+    """Whether sub-payloads fill a payload exactly."""
     start = 0
     while start + 2 <= len(payload):
         start += 2 + payload[start + 1]

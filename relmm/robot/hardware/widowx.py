@@ -86,8 +86,8 @@ class WidowX:
         ticks = self._read("Present_Position", ("shoulder", SHADOW))
         if abs(ticks["shoulder"] - ticks[SHADOW]) > _SAME_AXLE and self._configured(SHADOW):
             raise RobotError(
-                f"The two motors of the shoulder (2 and 3) disagree by {abs(ticks['shoulder'] - ticks[SHADOW])} of 4096 "
-                "ticks, and would fight: set the Homing_Offset of motor 3 so that both tell the same position."
+                f"The two motors of the shoulder (2 and 3) disagree by {abs(ticks['shoulder'] - ticks[SHADOW])} of "
+                "4096 ticks, and would fight: set the Homing_Offset of motor 3 so that both tell the same position."
             )
         for name in JOINTS:
             self._set_up(name)
@@ -181,8 +181,8 @@ class WidowX:
         for name, temperature in self._read("Present_Temperature", names).items():
             if temperature > MAX_TEMPERATURE:
                 raise RobotError(
-                    f"Motor {JOINTS[name].id} ({name}) is at {temperature} degrees C, and {MAX_TEMPERATURE} are allowed: "
-                    "let it cool down."
+                    f"Motor {JOINTS[name].id} ({name}) is at {temperature} degrees C, and {MAX_TEMPERATURE} are "
+                    "allowed: let it cool down."
                 )
 
     # --- Moving ------------------------------------------------------------------------------------------
@@ -290,8 +290,8 @@ def _open_bus(port: str) -> LocobotMotorsBus:
         raise RobotError("The arm needs dynamixel-sdk: pip install 'lerobot_policy_relmm[hardware]'.") from error
     except (ConnectionError, OSError, RuntimeError, termios.error, IndexError) as error:
         raise RobotError(
-            f"Not all motors of the arm answer on {port} ({_first_line(error)}): switch the robot on, check the cable, or "
-            "say another --robot.arm_port; relmm-doctor --robot.type=locobot asks every motor."
+            f"Not all motors of the arm answer on {port} ({_first_line(error)}): switch the robot on, check the cable, "
+            "or say another --robot.arm_port; relmm-doctor --robot.type=locobot asks every motor."
         ) from error
     return bus
 

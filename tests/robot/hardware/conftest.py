@@ -68,7 +68,10 @@ def emulate(tmp_path: Path) -> Iterator[Callable[..., Emulated]]:
         folder.mkdir()
         command = [sys.executable, str(HERE / "emulated_locobot.py"), str(folder), room]
         process = subprocess.Popen(
-            [*command, str(num_objects), str(seed), str(speed)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [*command, str(num_objects), str(seed), str(speed)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         running.append(process)
         assert process.stdout.readline() == "ready\n"

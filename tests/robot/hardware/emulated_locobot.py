@@ -123,7 +123,10 @@ class EmulatedLocobot:
         with self.chain.lock:
             now, motors = self.chain.now(), self.chain.motors
             goal = np.array(
-                [motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else motors[i].angle for i in ARM_IDS]
+                [
+                    motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else motors[i].angle
+                    for i in ARM_IDS
+                ]
             )
             for head in (10, 11):
                 motors[head].step(now, PERIOD_S)

@@ -41,7 +41,7 @@ def test_base_control_gives_golden_frames(x_vel, theta_vel, expected):
 
 
 def test_stop_is_the_golden_one():
-    assert STOP == bytes.fromhex("AA 55 06 01 04 00 00 00 00 03")
+    assert bytes.fromhex("AA 55 06 01 04 00 00 00 00 03") == STOP
 
 
 def test_other_commands_have_the_specified_bytes():
@@ -64,8 +64,8 @@ def test_speeds_beyond_what_the_frame_holds_are_clamped():
 
 
 def test_distance_of_a_tick_is_the_drivers():
-    assert M_PER_TICK == pytest.approx(8.5292090497737556e-5)
-    assert 1 / M_PER_TICK == pytest.approx(TICKS_PER_METRE, abs=0.1)
+    assert pytest.approx(8.5292090497737556e-5) == M_PER_TICK
+    assert pytest.approx(TICKS_PER_METRE, abs=0.1) == 1 / M_PER_TICK
 
 
 # --- Feedback ------------------------------------------------------------------------------------------------
@@ -112,7 +112,15 @@ def test_reader_takes_bytes_one_by_one_and_several_frames_at_once(base):
 
 def test_reader_finds_frames_behind_false_headers(base):
     good = encode_frame(payload(base))
-    for rubbish in (b"\xaa", b"\xaa\x55", b"\xaa\x55\xff", b"\xaa\x55\x03\x01\x01", b"\xaa\xaa\x55", good[:30], good[:-1]):
+    for rubbish in (
+        b"\xaa",
+        b"\xaa\x55",
+        b"\xaa\x55\xff",
+        b"\xaa\x55\x03\x01\x01",
+        b"\xaa\xaa\x55",
+        good[:30],
+        good[:-1],
+    ):
         assert FrameReader().feed(rubbish + good + good + good)[-1] == payload(base)
 
 
