@@ -69,6 +69,16 @@ relmm-record: record a robot's life as a LeRobot dataset.
   --seed=0                      of everything random
   --resume=true                 go on with the dataset in its folder
 """,
+    "relmm-calibrate": """\
+relmm-calibrate: measure what is particular to one LoCoBot; a person presses Enter.
+
+  relmm-calibrate --robot.type=locobot --robot.id=NAME
+
+  --robot.id=NAME               tells robots apart; say the same to relmm-train
+  --robot.base_port=DEVICE      if relmm-doctor --robot.type=locobot does not find it
+  --robot.arm_port=DEVICE       likewise
+  --steps=[camera,gripper]      only these of camera, gripper, sag, wheels, grasp
+""",
     "relmm-upload": """\
 relmm-upload: upload the newest checkpoint of a run, and a dataset; what is on the Hub already is not sent again.
 
@@ -104,6 +114,11 @@ def record() -> None:
 def upload() -> None:
     """Entry point of `relmm-upload`."""
     _start("relmm-upload", "upload")
+
+
+def calibrate() -> None:
+    """Entry point of `relmm-calibrate`."""
+    _start("relmm-calibrate", "calibrate")
 
 
 def _start(command: str, module: str) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from relmm.errors import RobotError
 from relmm.features import FloatArray
-from relmm.geometry import CameraGeometry
+from relmm.geometry import CameraGeometry, arm_forward, arm_inverse
 from relmm.robot.body import BodyState
 from relmm.robot.hardware import clock
 from relmm.robot.hardware.calibration import Calibration
@@ -27,6 +27,7 @@ _SLICE_S = 0.02  # between looks at what may have gone wrong
 _MAX_LATE_S, _LEAST_S = 0.1, 0.001  # that a wait makes up for, and that are worth a sleep
 _PAN, _TILT = 0.0, 0.825  # rad, as the authors had it
 _HEAD_S = 1.2
+_POINTS_DOWN = 1.4  # rad, of the gripper's pitch
 _RECONNECT_S = 60.0  # to wait for a base whose cable is out
 
 
@@ -53,7 +54,7 @@ class LocobotBody:
     ) -> None:
         self.base, self.arm, self.eye = base, arm, camera
         self.camera = replace(view, position=(*view.position[:2], calibration.camera_height))
-        self._say = say
+        self._say, self._calibration = say, calibration
         self._start = self._due = clock.now()  # `_due`: when the last wait was to end
         self._arm_state: tuple[float, ArmState] | None = None
 
@@ -89,7 +90,7 @@ class LocobotBody:
         """
         self._tell(f"move the arm to {np.degrees(joints).round().tolist()} degrees in {seconds:.1f} s")
         self._arm_state = None
-        self.arm.move(joints, seconds)
+        self.arm.move(self._corrected(joints), seconds)
         self._due = clock.now()
 
     def set_gripper(self, opening: float) -> None:
@@ -152,6 +153,14 @@ class LocobotBody:
                 self.arm.lie_down(clock.sleep)
             except RobotError as error:
                 logger.warning("The arm was not laid down: %s", error)
+
+    def _corrected(self, joints: FloatArray) -> FloatArray:
+        """The same pose, shifted by what the calibration's touches have shown; only where the gripper points down."""
+        pitch = float(joints[1:4].sum())
+        if self._calibration.grasp == Calibration().grasp or pitch < _POINTS_DOWN:
+            return joints
+        x, y, z = arm_forward(joints)[3]
+        return arm_inverse(*self._calibration.corrected(x, y), z, pitch, float(joints[4]))
 
     # --- Watching ----------------------------------------------------------------------------------------
     def _watch(self) -> None:

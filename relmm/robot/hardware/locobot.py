@@ -45,6 +45,11 @@ class Locobot(LocobotRobot):
         """
         raise RobotError("Calibrate a LoCoBot with relmm-calibrate --robot.type=locobot, which guides you through it.")
 
+    def take_measured(self, calibration: Calibration) -> None:
+        """Use another calibration from the next connection on, and save it."""
+        self.measured = calibration
+        self._save_calibration()
+
     def _load_calibration(self, fpath: Path | None = None) -> None:
         self.measured = load_calibration(fpath or self.calibration_fpath)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from relmm.errors import RobotError
 from relmm.features import FloatArray
+from relmm.geometry import arm_forward
 from relmm.robot.body import MAX_OPENING
 from relmm.robot.hardware import clock
 from relmm.robot.hardware.arm_safety import check_way
@@ -213,7 +214,7 @@ class WidowX:
 
     def _lift(self, joints: FloatArray) -> FloatArray:
         """By how much the goal has to be higher than where the arm is to be, because it hangs; rad, shape (5,)."""
-        return self._sag * _load(joints)
+        return self._sag * load_of(joints)
 
     def look(self, pan: float, tilt: float) -> None:
         """Turn the camera (rad)."""
@@ -296,10 +297,8 @@ def _open_bus(port: str) -> LocobotMotorsBus:
     return bus
 
 
-def _load(joints: FloatArray) -> FloatArray:
+def load_of(joints: FloatArray) -> FloatArray:
     """What gravity does to each joint, as a share of what it does to the arm stretched out level; shape (5,)."""
-    from relmm.geometry import arm_forward
-
     corners = arm_forward(joints)
     forward = np.array([np.cos(joints[0]), np.sin(joints[0])])
     reach = (corners[:, :2] - corners[0, :2]) @ forward  # m, of elbow, wrist and tool, before the shoulder

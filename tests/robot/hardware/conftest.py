@@ -51,11 +51,11 @@ class Emulated:
             f"--robot.calibration_dir={folder}/calibration",
         ]
 
-    def collected(self) -> int:
-        """Objects in its basket, by the simulator."""
-        self.process.stdin.write("count\n")
+    def put(self, x: float, y: float) -> None:
+        """Lay the first object down as a person would; m, robot frame."""
+        self.process.stdin.write(f"put {x} {y}\n")
         self.process.stdin.flush()
-        return int(self.process.stdout.readline())
+        assert self.process.stdout.readline() == "put\n"
 
 
 @pytest.fixture
