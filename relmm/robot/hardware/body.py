@@ -18,7 +18,7 @@ from relmm.robot.hardware import clock
 from relmm.robot.hardware.calibration import Calibration
 from relmm.robot.hardware.d435 import D435
 from relmm.robot.hardware.kobuki import Kobuki
-from relmm.robot.hardware.kobuki_protocol import BATTERY_LOW, Sound
+from relmm.robot.hardware.kobuki_protocol import BATTERY_CHARGED, BATTERY_EMPTY, BATTERY_LOW, Charger, Sound
 from relmm.robot.hardware.widowx import ArmState, WidowX
 
 logger = logging.getLogger(__name__)
@@ -28,6 +28,7 @@ _MAX_LATE_S, _LEAST_S = 0.1, 0.001  # that a wait makes up for, and that are wor
 _PAN, _TILT = 0.0, 0.825  # rad, as the authors had it
 _HEAD_S = 1.2
 _POINTS_DOWN = 1.4  # rad, of the gripper's pitch
+_CHARGE_POLL_S = 1.0
 _RECONNECT_S = 60.0  # to wait for a base whose cable is out
 
 
@@ -74,6 +75,29 @@ class LocobotBody:
         self.arm.configure()
         self.arm.look(_PAN, _TILT)
         self.wait(_HEAD_S)
+
+    @property
+    def needs_charging(self) -> bool:
+        """Whether the battery is low."""
+        return self.base.state().battery < BATTERY_LOW
+
+    def await_charge(self, should_stop: Callable[[], bool]) -> None:
+        """Lie down until the battery is full and the charger is pulled out again, or until told to stop."""
+        self.base.stop()
+        self.base.play(Sound.RECHARGE)
+        self.arm.lie_down(clock.sleep)
+        logger.warning(
+            "The battery is at %.1f V: charge the robot. It goes on by itself at %.1f V, without the charger.",
+            *(self.base.state().battery, BATTERY_CHARGED),
+        )
+        while not should_stop():
+            state = self.base.state()
+            if self.base.alive and state.battery >= BATTERY_CHARGED and state.charger == Charger.NONE:
+                break
+            clock.sleep(_CHARGE_POLL_S)
+        self.base.play(Sound.ON)
+        self.arm.configure()
+        self._due = clock.now()
 
     # --- Body --------------------------------------------------------------------------------------------
     def drive(self, x_vel: float, theta_vel: float) -> None:
@@ -168,6 +192,8 @@ class LocobotBody:
             self._wait_for_base()
         if not self.eye.alive:
             raise RobotError("The camera sends no pictures: check its cable, and that it is plugged into USB 3.")
+        if (battery := self.base.state().battery) < BATTERY_EMPTY:
+            raise RobotError(f"The battery is at {battery:.1f} V, nearly empty: charge the robot, and start again.")
         self.arm.check_health()
         self.arm.update()
 

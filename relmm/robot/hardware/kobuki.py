@@ -51,7 +51,7 @@ class BaseState:
         travelled: m since the start; backwards counts negative.
         heading: degrees since the start, positive = left, not wrapped.
         bumper, cliff, wheel_drop, over_current, charger, buttons: as `Feedback`, of the last packet.
-        battery: V.
+        battery: V, smoothed over a second: it drops for a moment when the motors start.
         bumped: bits of the bumper that were pressed at any time since `Kobuki.forget_bumps`.
         firmware: its version, None before it has told.
     """
@@ -212,7 +212,7 @@ class Kobuki:
             over_current=feedback.over_current,
             charger=feedback.charger,
             buttons=feedback.buttons,
-            battery=feedback.battery,
+            battery=_smoothed(before, feedback.battery),
             bumped=before.bumped | feedback.bumper,
             firmware=feedback.firmware or before.firmware,
         )
@@ -270,6 +270,10 @@ class Kobuki:
         with self._lock:
             self._halt()
             self._program, self._guard = self._start_guard()
+
+
+def _smoothed(before: BaseState, battery: float) -> float:
+    return before.battery + (battery - before.battery) * PERIOD_S if before.packets else battery
 
 
 def _clamp(value: float, low: float, high: float) -> float:

@@ -22,8 +22,8 @@ WHEELBASE = 0.230  # m
 TICKS_PER_TURN = 52 * 6545 / 132  # of a wheel: 52 of the motor, times the gear
 M_PER_TICK = 2 * math.pi * 0.035 / TICKS_PER_TURN
 
-# V. Below the first the driver of the manufacturer warns, below the second it calls the battery dangerously empty.
-BATTERY_FULL, BATTERY_LOW, BATTERY_EMPTY = 16.5, 14.0, 13.2
+# V. Below LOW the manufacturer's driver warns, below EMPTY it calls the battery dangerously empty; CHARGED is ours.
+BATTERY_FULL, BATTERY_CHARGED, BATTERY_LOW, BATTERY_EMPTY = 16.5, 16.0, 14.0, 13.2
 
 _HEADER = b"\xaa\x55"
 _MIN_PAYLOAD, _MAX_PAYLOAD = 3, 160  # bytes; the base's largest is 124, and a false length must not hide what follows

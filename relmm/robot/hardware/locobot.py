@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 from relmm.errors import RobotError
@@ -90,6 +91,17 @@ class Locobot(LocobotRobot):
             body.start()
             opened.pop_all()
         return body
+
+    @property
+    def needs_charging(self) -> bool:
+        """See `LocobotRobot`."""
+        return self.body.needs_charging
+
+    def await_charge(self, should_stop: Callable[[], bool]) -> None:
+        """See `LocobotRobot`."""
+        self.body.await_charge(should_stop)
+        self.skills.rest()
+        self.skills.forget_picture()
 
     @property
     def body(self) -> LocobotBody:

@@ -85,7 +85,7 @@ def test_speed_grows_with_limited_acceleration_and_is_clamped(base, kobuki):
 
 def test_state_tells_battery_and_firmware(base, kobuki):
     base.battery = 14.2
-    wait_for(lambda: kobuki.state().battery == pytest.approx(14.2), "the battery")
+    wait_for(lambda: kobuki.state().battery == pytest.approx(14.2, abs=0.05), "the battery")
     wait_for(lambda: kobuki.state().firmware == (1, 2, 0), "the firmware's version")
 
 
