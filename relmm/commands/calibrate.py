@@ -16,6 +16,7 @@ from relmm.robot.hardware.body import LocobotBody
 from relmm.robot.hardware.calibration import Calibration
 from relmm.robot.hardware.locobot import Locobot
 from relmm.robot.hardware.measuring import (
+    measure_arm_delay,
     measure_camera,
     measure_grasp,
     measure_gripper,
@@ -37,6 +38,10 @@ class Step:
     measure: Callable[[LocobotBody, Calibration], dict[str, Any]]
 
 
+def _measure_arm(body: LocobotBody, old: Calibration) -> dict[str, Any]:
+    return {**measure_arm_delay(body, old.arm_delay), **measure_sag(body, old.sag_array())}
+
+
 STEPS = {
     "camera": Step(
         "Put the robot onto empty floor, 1 m free in front of it",
@@ -45,8 +50,9 @@ STEPS = {
     "gripper": Step(
         "See that nothing is between the fingers", lambda body, old: measure_gripper(body, old.closed_opening)
     ),
-    "sag": Step(
-        "Keep away from the arm: it stretches out over the floor", lambda body, old: measure_sag(body, old.sag_array())
+    "arm": Step(
+        "Keep away from the arm: it moves fast, and stretches out over the floor",
+        _measure_arm,
     ),
     "wheels": Step(
         "Put the robot 0.6 m in front of a wall, square to it: it drives 0.15 m towards it",
@@ -65,7 +71,7 @@ class CalibrateConfig:
 
     Args:
         robot: `--robot.type=locobot`.
-        steps: which measurements, [camera,gripper,sag,wheels,grasp]; later ones use what earlier ones found.
+        steps: which measurements, [camera,gripper,arm,wheels,grasp]; later ones use what earlier ones found.
     """
 
     robot: RobotConfig

@@ -77,7 +77,7 @@ relmm-calibrate: measure what is particular to one LoCoBot; a person presses Ent
   --robot.id=NAME               tells robots apart; say the same to relmm-train
   --robot.base_port=DEVICE      if relmm-doctor --robot.type=locobot does not find it
   --robot.arm_port=DEVICE       likewise
-  --steps=[camera,gripper]      only these of camera, gripper, sag, wheels, grasp
+  --steps=[camera,gripper]      only these of camera, gripper, arm, wheels, grasp
 """,
     "relmm-upload": """\
 relmm-upload: upload the newest checkpoint of a run, and a dataset; what is on the Hub already is not sent again.

@@ -36,6 +36,7 @@ ALIVE_S = 0.5  # s without a packet after which a base counts as lost; the drive
 _START_S = 5.0  # s to wait for its first packet
 _MAX_ACCELERATION = (2.2, 600.0)  # m/s^2 and deg/s^2, as in the simulation
 _MAX_BACKWARDS = 0.15  # m/s, blind
+_COASTING_S = 0.3  # that it takes to stand still
 _CHUNK = 65_536
 _DRIVING, _STANDING = Output.POWER | Output.LED1_GREEN | Output.LED2_GREEN, Output.POWER | Output.LED1_GREEN
 _STOPPED = Output.POWER | Output.LED1_RED | Output.LED2_RED
@@ -91,6 +92,7 @@ class Kobuki:
         self._state, self._odometry, self._reader = BaseState(), Odometry(wheel_scale), FrameReader()
         self._goal, self._expires = (0.0, 0.0), 0.0  # m/s and deg/s
         self._velocity = (0.0, 0.0)
+        self._moved = float("-inf")  # when it was last told to move
         self._blocked = False  # whether the goal was dropped because of what the base met
         self._extra = [request_versions()]  # sub-payloads to send once
         self._open = True
@@ -200,7 +202,7 @@ class Kobuki:
         if before.packets and now - before.time > ALIVE_S:
             self._odometry.forget_position()  # it may have been switched off, and counts from 0 again
             self._extra.append(request_versions())
-        self._odometry.update(feedback)
+        self._odometry.update(feedback, now - self._moved < _COASTING_S)
         self._state = BaseState(
             packets=before.packets + 1,
             time=now,
@@ -243,6 +245,8 @@ class Kobuki:
 
     def _send_command(self) -> None:
         moving = self._velocity != (0.0, 0.0)
+        if moving:
+            self._moved = clock.now()
         lights = _STOPPED if self._blocked else _DRIVING if moving else _STANDING
         control = base_control(self._velocity[0], math.radians(self._velocity[1]))
         command = frame(base_control(0.0, 0.0) if self._dry else control, general_output(lights), *self._extra)

@@ -83,7 +83,7 @@ class Locobot(LocobotRobot):
             base = Kobuki(base_port, measured.wheel_scale, config.dry_run)
             opened.callback(base.close)
             base.wait_until_there()
-            arm = WidowX(arm_port, measured.sag_array(), measured.closed_opening, config.dry_run)
+            arm = WidowX(arm_port, measured.sag_array(), measured.closed_opening, measured.arm_delay, config.dry_run)
             opened.callback(arm.close)
             camera = D435(serial_number, view, measured.camera_pitch, measured.latency)
             opened.callback(camera.close)

@@ -12,6 +12,7 @@ from relmm.errors import RobotError
 from relmm.features import DRIVE_PULSE_S, FloatArray
 from relmm.geometry import CameraGeometry, arm_inverse
 from relmm.robot.body import MAX_OPENING
+from relmm.robot.hardware import clock
 from relmm.robot.hardware.body import LocobotBody
 from relmm.robot.hardware.widowx import load_of
 from relmm.robot.skills import REST_POSE
@@ -21,6 +22,7 @@ _TRIALS, _INLIER, _MIN_FLOOR = 200, 0.008, 0.5  # of fitting a plane: m, and the
 _SPOTS = ((0.33, -0.05), (0.33, 0.05), (0.43, -0.05), (0.43, 0.05), (0.38, 0.0))  # m, where the gripper points
 _ABOVE_Z, _TOUCH_Z = 0.10, 0.012
 _WALL_PULSES = 6
+_LOOKS, _LOOK_S = 40, 0.04
 _SETTLE_S = 0.6
 _CHANGED = 30  # of 255, by which a sticker changes the floor's colour
 
@@ -92,6 +94,23 @@ def measure_sag(body: LocobotBody, sag_before: FloatArray) -> dict[str, tuple[fl
     square = (load**2).sum(axis=0)
     slope = np.divide((load * error).sum(axis=0), square, out=np.zeros(5), where=square > 1e-9)
     return {"sag": tuple(round(float(value), 4) for value in sag_before - slope)}
+
+
+def measure_arm_delay(body: LocobotBody, delay_before: float) -> dict[str, float]:
+    """How long the joints trail behind the motors' profiles: their distance by their speed, on a fast way."""
+    body.move_arm(arm_inverse(0.45, 0.0, 0.12, _DOWN), 1.0)
+    looks = []
+    for _ in range(_LOOKS):
+        body.wait(1.0 / _LOOKS)
+        looks.append((clock.now(), body.arm.state()))
+    body.move_arm(REST_POSE, 2.0)
+    body.wait(2.0 + _SETTLE_S)
+    times = np.array([time for time, _ in looks])
+    goals, joints = (np.array([getattr(state, name) for _, state in looks]) for name in ("goal", "joints"))
+    speed = np.gradient(goals, times, axis=0)
+    trailing = float(((goals - joints) * speed).sum() / (speed**2).sum())
+    # A look of the skills lasts 0.04 s, and joints may be anywhere between two of them: half of it is left to them.
+    return {"arm_delay": round(max(trailing + delay_before - _LOOK_S / 2, 0.0), 3)}
 
 
 def measure_wheels(body: LocobotBody, scale_before: float) -> dict[str, float]:

@@ -97,7 +97,7 @@ def test_command_measures_camera_gripper_and_sag(emulate):
     here = Path(__file__).parent
     command = [sys.executable, str(here / "locobot_command.py"), str(emulated.folder), "relmm.commands.calibrate"]
     done = subprocess.run(
-        [*command, *emulated.options, "--robot.id=me", "--steps=[camera,gripper,sag]"],
+        [*command, *emulated.options, "--robot.id=me", "--steps=[camera,gripper,arm]"],
         input="\n\n\n",
         env={**emulated.environment, "PYTHONPATH": emulated.environment["PYTHONPATH"] + os.pathsep + str(here)},
         capture_output=True,
@@ -109,4 +109,5 @@ def test_command_measures_camera_gripper_and_sag(emulate):
     assert measured.camera_height == pytest.approx(CAMERAS["d435"].position[2], abs=0.004)
     assert measured.camera_pitch == pytest.approx(CAMERAS["d435"].pitch, abs=0.3)
     assert measured.closed_opening == pytest.approx(0.0, abs=0.002)
+    assert 0.01 < measured.arm_delay < 0.1
     assert np.abs(measured.sag).max() < 0.03, "the simulated arm hardly hangs"
