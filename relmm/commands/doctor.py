@@ -1,18 +1,26 @@
-"""relmm-doctor: is everything here that relmm needs? What is missing is said in one sentence each."""
+"""relmm-doctor: is everything here that relmm needs? What is missing is said in one sentence each.
+
+With --robot.type=locobot also the robot: its devices, every motor, the camera; nothing moves.
+"""
 
 from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import logging
+import os
 import shutil
 import sys
-from collections.abc import Callable
+import tempfile
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from relmm.errors import RelmmError
 
 _PACKAGES = ("lerobot", "torch", "mujoco", "gymnasium", "numpy", "opencv-python-headless", "huggingface-hub")
 _MIN_FREE_GB = 1.0
+_TRIAL_MB, _MIN_MB_PER_S = 20, 5.0
 
 
 def check_python() -> str:
@@ -77,16 +85,54 @@ CHECKS: dict[str, Callable[[], str]] = {
 }
 
 
+def check_disk_speed() -> str:
+    """Whether a recording can be written while the robot lives."""
+    block = bytes(1_000_000)
+    with tempfile.TemporaryFile(dir=Path.cwd()) as file:
+        began = time.perf_counter()
+        for _ in range(_TRIAL_MB):
+            file.write(block)
+        file.flush()
+        os.fsync(file.fileno())
+        speed = _TRIAL_MB / (time.perf_counter() - began)
+    if speed < _MIN_MB_PER_S:
+        raise RelmmError(f"This disk takes {speed:.1f} MB/s: record to a faster one, not to a memory card.")
+    return f"{speed:.0f} MB/s can be written here"
+
+
+def checks_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Callable[[], str]]]:
+    """All checks, those of the robot included if one was named."""
+    yield from CHECKS.items()
+    if arguments.type == "locobot":
+        from relmm.robot.hardware.config_locobot import LocobotConfig
+        from relmm.robot.hardware.diagnosis import hardware_checks
+
+        logging.getLogger("lerobot").setLevel(logging.ERROR)
+        yield "disk speed", check_disk_speed
+        yield from hardware_checks(
+            LocobotConfig(
+                base_port=arguments.base_port, arm_port=arguments.arm_port, camera_serial=arguments.camera_serial
+            )
+        )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="relmm-doctor", description=__doc__, allow_abbrev=False)
+    parser.add_argument("--robot.type", dest="type", choices=("locobot", "locobot_sim"), help="also look at this robot")
+    for name in ("base_port", "arm_port", "camera_serial"):
+        parser.add_argument(f"--robot.{name}", dest=name, default="auto", help="as of relmm-train")
+    return parser
+
+
 def main() -> None:
     """Entry point of `relmm-doctor`; exits with 1 if something is missing."""
-    argparse.ArgumentParser(prog="relmm-doctor", description=__doc__).parse_args()
     failed = 0
-    for name, check in CHECKS.items():
+    for name, check in checks_of(_parser().parse_args()):
         try:
-            print(f"  ok    {name:10} {check()}")
+            print(f"  ok    {name:15} {check()}")
         except RelmmError as error:
             failed += 1
-            print(f"  FAIL  {name:10} {error}")
+            print(f"  FAIL  {name:15} {error}")
     sys.exit(1 if failed else 0)
 
 

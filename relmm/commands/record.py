@@ -14,7 +14,7 @@ from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.policies import FreshWeights, check_camera, make_actor, policy_from_path, take_seed
-from relmm.commands.robots import make_locobot
+from relmm.commands.robots import Pause, make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
 from relmm.episodes import (
@@ -190,7 +190,9 @@ def _collector(
 ) -> Collector | Cleaner:
     practice = config.mode == "practice"
     to_collect = None if practice else robot.body.room.num_objects if isinstance(robot, LocobotSim) else math.inf
-    life = Life(robot, [recorder], robot.seconds, config.max_steps, should_stop, to_collect)
+    pause = Pause(robot, should_stop)
+    life = Life(robot, [recorder], robot.seconds, config.max_steps, pause, to_collect)
+    pause.charged = life.look_again
     if practice:
         return Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
     rooms = np.random.default_rng([seed, _ROOMS_STREAM])

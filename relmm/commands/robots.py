@@ -2,11 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.policies import take_seed
 from relmm.errors import ConfigError
 from relmm.robot.locobot import LocobotRobot
+
+
+class Pause:
+    """Asked after every frame whether to end the episode: on a signal, and when the battery is low.
+
+    A low battery first ends the episode, which is saved then; when asked again, it waits for the charge.
+
+    Args:
+        robot: connected.
+        stopped: whether there was a signal.
+    """
+
+    def __init__(self, robot: LocobotRobot, stopped: Callable[[], bool]) -> None:
+        self._robot, self._stopped = robot, stopped
+        self._low = False
+        self.charged: Callable[[], None] = lambda: None  # called when the robot goes on
+
+    def __call__(self) -> bool:
+        """Whether to end the episode here."""
+        if self._stopped():
+            return True
+        if self._low:
+            self._robot.await_charge(self._stopped)
+            self._low = False
+            self.charged()
+        self._low = self._robot.needs_charging
+        return self._low or self._stopped()
 
 
 def make_locobot(config: RobotConfig, seed: int, command: str) -> LocobotRobot:

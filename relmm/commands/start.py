@@ -85,6 +85,16 @@ relmm-analyze: what a robot did, where it grasps well, and whether its confidenc
   --output_dir=FOLDER           new: report.html, summary.json, grasps.parquet, steps.parquet, figures/
   --overwrite=true              replace the report in that folder
 """,
+    "relmm-calibrate": """\
+relmm-calibrate: measure what is particular to one LoCoBot; a person presses Enter.
+
+  relmm-calibrate --robot.type=locobot --robot.id=NAME
+
+  --robot.id=NAME               tells robots apart; say the same to relmm-train
+  --robot.base_port=DEVICE      if relmm-doctor --robot.type=locobot does not find it
+  --robot.arm_port=DEVICE       likewise
+  --steps=[camera,gripper]      only these of camera, gripper, arm, wheels, grasp
+""",
     "relmm-upload": """\
 relmm-upload: upload the newest checkpoint of a run, and a dataset; what is on the Hub already is not sent again.
 
@@ -125,6 +135,11 @@ def analyze() -> None:
 def upload() -> None:
     """Entry point of `relmm-upload`."""
     _start("relmm-upload", "upload")
+
+
+def calibrate() -> None:
+    """Entry point of `relmm-calibrate`."""
+    _start("relmm-calibrate", "calibrate")
 
 
 def _start(command: str, module: str) -> None:

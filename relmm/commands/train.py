@@ -16,7 +16,7 @@ from relmm.commands.curve import draw_learning_curve
 from relmm.commands.hub_resume import take_over_from_hub
 from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
-from relmm.commands.robots import make_locobot
+from relmm.commands.robots import Pause, make_locobot
 from relmm.commands.sharing import check_uploads
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
@@ -75,14 +75,17 @@ def _train_on_robot(run: Run) -> None:
             run.read_own_data()  # now that nobody else writes to it
             if damaged:
                 run.save(recorder.saved_episodes)
+            pause = Pause(robot, lambda: run.signals.stopped)
             life = Life(
-                robot,
-                [recorder, run.learner, run.progress],
-                robot.seconds,
-                config.max_steps,
-                should_stop=lambda: run.signals.stopped,
+                robot, [recorder, run.learner, run.progress], robot.seconds, config.max_steps, should_stop=pause
             )
             person = _person(robot, seed)
+
+            def charged() -> None:
+                run.progress.interventions += 1
+                life.look_again()
+
+            pause.charged = charged
             trainer = Trainer(
                 life,
                 run.policy,

@@ -6,6 +6,7 @@ import logging
 import math
 import weakref
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -143,6 +144,14 @@ class LocobotRobot(Robot):
         if self._skills is None:
             raise RobotError(f"{self} is not connected: call connect() first.")
         return self._skills
+
+    @property
+    def needs_charging(self) -> bool:
+        """Whether the robot should not go on without its battery being charged; a simulated one never."""
+        return False
+
+    def await_charge(self, should_stop: Callable[[], bool]) -> None:
+        """Wait until a person has charged it, or until told to stop; it may stand elsewhere then, and so may things."""
 
     def seconds(self) -> float:
         """The robot's own clock, s since it was connected."""

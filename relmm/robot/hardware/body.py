@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from relmm.errors import RobotError
 from relmm.features import FloatArray
-from relmm.geometry import CameraGeometry
+from relmm.geometry import CameraGeometry, arm_forward, arm_inverse
 from relmm.robot.body import BodyState
 from relmm.robot.hardware import clock
 from relmm.robot.hardware.calibration import Calibration
 from relmm.robot.hardware.d435 import D435
 from relmm.robot.hardware.kobuki import Kobuki
-from relmm.robot.hardware.kobuki_protocol import BATTERY_LOW, Sound
+from relmm.robot.hardware.kobuki_protocol import BATTERY_CHARGED, BATTERY_EMPTY, BATTERY_LOW, Charger, Sound
 from relmm.robot.hardware.widowx import ArmState, WidowX
 
 logger = logging.getLogger(__name__)
@@ -27,6 +27,8 @@ _SLICE_S = 0.02  # between looks at what may have gone wrong
 _MAX_LATE_S, _LEAST_S = 0.1, 0.001  # that a wait makes up for, and that are worth a sleep
 _PAN, _TILT = 0.0, 0.825  # rad, as the authors had it
 _HEAD_S = 1.2
+_POINTS_DOWN = 1.4  # rad, of the gripper's pitch
+_CHARGE_POLL_S = 1.0
 _RECONNECT_S = 60.0  # to wait for a base whose cable is out
 
 
@@ -53,7 +55,7 @@ class LocobotBody:
     ) -> None:
         self.base, self.arm, self.eye = base, arm, camera
         self.camera = replace(view, position=(*view.position[:2], calibration.camera_height))
-        self._say = say
+        self._say, self._calibration = say, calibration
         self._start = self._due = clock.now()  # `_due`: when the last wait was to end
         self._arm_state: tuple[float, ArmState] | None = None
 
@@ -74,6 +76,29 @@ class LocobotBody:
         self.arm.look(_PAN, _TILT)
         self.wait(_HEAD_S)
 
+    @property
+    def needs_charging(self) -> bool:
+        """Whether the battery is low."""
+        return self.base.state().battery < BATTERY_LOW
+
+    def await_charge(self, should_stop: Callable[[], bool]) -> None:
+        """Lie down until the battery is full and the charger is pulled out again, or until told to stop."""
+        self.base.stop()
+        self.base.play(Sound.RECHARGE)
+        self.arm.lie_down(clock.sleep)
+        logger.warning(
+            "The battery is at %.1f V: charge the robot. It goes on by itself at %.1f V, without the charger.",
+            *(self.base.state().battery, BATTERY_CHARGED),
+        )
+        while not should_stop():
+            state = self.base.state()
+            if self.base.alive and state.battery >= BATTERY_CHARGED and state.charger == Charger.NONE:
+                break
+            clock.sleep(_CHARGE_POLL_S)
+        self.base.play(Sound.ON)
+        self.arm.configure()
+        self._due = clock.now()
+
     # --- Body --------------------------------------------------------------------------------------------
     def drive(self, x_vel: float, theta_vel: float) -> None:
         """See `Body.drive`; without another command the base stops after 0.5 s."""
@@ -89,7 +114,7 @@ class LocobotBody:
         """
         self._tell(f"move the arm to {np.degrees(joints).round().tolist()} degrees in {seconds:.1f} s")
         self._arm_state = None
-        self.arm.move(joints, seconds)
+        self.arm.move(self._corrected(joints), seconds)
         self._due = clock.now()
 
     def set_gripper(self, opening: float) -> None:
@@ -153,12 +178,22 @@ class LocobotBody:
             except RobotError as error:
                 logger.warning("The arm was not laid down: %s", error)
 
+    def _corrected(self, joints: FloatArray) -> FloatArray:
+        """The same pose, shifted by what the calibration's touches have shown; only where the gripper points down."""
+        pitch = float(joints[1:4].sum())
+        if self._calibration.grasp == Calibration().grasp or pitch < _POINTS_DOWN:
+            return joints
+        x, y, z = arm_forward(joints)[3]
+        return arm_inverse(*self._calibration.corrected(x, y), z, pitch, float(joints[4]))
+
     # --- Watching ----------------------------------------------------------------------------------------
     def _watch(self) -> None:
         if not self.base.alive:
             self._wait_for_base()
         if not self.eye.alive:
             raise RobotError("The camera sends no pictures: check its cable, and that it is plugged into USB 3.")
+        if (battery := self.base.state().battery) < BATTERY_EMPTY:
+            raise RobotError(f"The battery is at {battery:.1f} V, nearly empty: charge the robot, and start again.")
         self.arm.check_health()
         self.arm.update()
 

@@ -21,6 +21,7 @@ _LIMITS = {
     "wheel_scale": (0.8, 1.25),
     "closed_opening": (-0.01, 0.01),
     "latency": (0.0, 0.5),
+    "arm_delay": (0.0, 0.3),
 }
 
 
@@ -33,7 +34,8 @@ class Calibration:
         camera_pitch: degrees below the horizontal.
         wheel_scale: true distance by the one that the wheels' encoders tell.
         closed_opening: m that the gripper tells when its pads touch.
-        sag: rad that each joint hangs down with the arm stretched out level, waist to wrist rotation.
+        arm_delay: s that the joints trail behind the motors' profiles.
+        sag: rad that each joint has to be lifted with the arm stretched out level, waist to wrist rotation.
         grasp: x, y of where the gripper goes = `grasp` times (x, y, 1) of where it is to go: two rows, m.
         latency: s between what happens and the picture that shows it.
     """
@@ -42,6 +44,7 @@ class Calibration:
     camera_pitch: float = _NOMINAL.pitch
     wheel_scale: float = 1.0
     closed_opening: float = 0.0
+    arm_delay: float = 0.04
     sag: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     grasp: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     latency: float = 0.08

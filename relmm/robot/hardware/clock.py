@@ -6,7 +6,7 @@ import time
 
 
 def now() -> float:
-    """s since some moment."""
+    """Seconds since some moment."""
     return time.monotonic()
 
 

@@ -16,6 +16,7 @@ from relmm.geometry import CameraGeometry
 
 WIDTH, HEIGHT, FPS = 640, 480, 30
 _SUPERSAMPLING = 4  # a picture of 100x100 is averaged from one four times as large
+_NO_MAP = np.empty(0, np.float32)  # the other map holds columns and rows
 _POLL_S, _LOST_S = 0.005, 2.0
 
 
@@ -41,7 +42,7 @@ class AlignedRealSense(RealSenseCamera):
         return np.array([values.fx, values.fy, values.ppx, values.ppy])
 
     def depth_unit(self) -> float:
-        """mm of one step of its depth."""
+        """One step of its depth, mm."""
         profile: Any = self.rs_profile
         return float(profile.get_device().first_depth_sensor().get_depth_scale() * 1000)
 
@@ -67,7 +68,7 @@ class D435:
 
     def __init__(self, serial_number: str | None, view: CameraGeometry, pitch: float, latency: float) -> None:
         self._latency = latency
-        self._camera = _connect(serial_number)
+        self._camera = open_camera(serial_number)
         self._unit = self._camera.depth_unit()
         self._maps = view_maps(view, pitch, self._camera.intrinsics())
 
@@ -121,19 +122,19 @@ class ViewMaps:
 
     def color(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The wanted picture, uint8 (rows, columns, 3)."""
-        fine = cv2.remap(picture, self._fine, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        fine = cv2.remap(picture, self._fine, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(cv2.resize(fine, self._scale.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
     def depth(self, picture: FloatArray) -> NDArray[np.uint16]:
         """The wanted depth, mm, uint16 (rows, columns); 0 where nothing was measured. Never a mean of near and far."""
         nearest = cv2.remap(
-            picture.astype(np.float32), self._coarse, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+            picture.astype(np.float32), self._coarse, _NO_MAP, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
         )
         return np.rint(np.minimum(nearest * self._scale, 65_535)).astype(np.uint16)
 
 
 def view_maps(view: CameraGeometry, pitch: float, intrinsics: FloatArray) -> ViewMaps:
-    """How to see through `view` with a camera of these intrinsics (fx, fy, cx, cy) that looks down by `pitch` degrees."""
+    """How to see through `view` with a camera of intrinsics (fx, fy, cx, cy) that looks down by `pitch` degrees."""
     real = CameraGeometry(position=(0.0, 0.0, 0.0), pitch=pitch, fov=(60.0, 60.0))
 
     def pixels(size: tuple[int, int]) -> tuple[NDArray[np.float32], FloatArray]:
@@ -148,7 +149,12 @@ def view_maps(view: CameraGeometry, pitch: float, intrinsics: FloatArray) -> Vie
     return ViewMaps(fine, coarse, 1.0 / forward)
 
 
-def _connect(serial_number: str | None) -> AlignedRealSense:
+def open_camera(serial_number: str | None) -> AlignedRealSense:
+    """LeRobot's camera, connected; None for the only one.
+
+    Raises:
+        RobotError: it cannot be; says what to do.
+    """
     try:
         number = serial_number or _only_camera()
         config = RealSenseCameraConfig(number, fps=FPS, width=WIDTH, height=HEIGHT, use_depth=True)
@@ -156,8 +162,8 @@ def _connect(serial_number: str | None) -> AlignedRealSense:
         camera.connect()
     except ImportError as error:
         raise RobotError(
-            "The camera needs pyrealsense2 (pip install 'lerobot_policy_relmm[hardware]'); where there is no wheel of it "
-            "for this machine, build librealsense with its Python bindings, or drive the robot from an x86-64 one."
+            "The camera needs pyrealsense2 (pip install 'lerobot_policy_relmm[hardware]'); where there is no wheel of "
+            "it for this machine, build librealsense with its Python bindings, or drive the robot from an x86-64 one."
         ) from error
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         raise RobotError(

@@ -124,10 +124,9 @@ def main() -> None:
     for ignored in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGTSTP):
         signal.signal(ignored, signal.SIG_IGN)
     port, number = sys.argv[1:]
-    with socket.socket(fileno=int(number)) as program:
-        # A program that was killed while bytes were under way resets the socket instead of closing it.
-        with contextlib.suppress(ConnectionError):
-            Guard(port, program).run()
+    # A program that was killed while bytes were under way resets the socket instead of closing it.
+    with socket.socket(fileno=int(number)) as program, contextlib.suppress(ConnectionError):
+        Guard(port, program).run()
 
 
 if __name__ == "__main__":

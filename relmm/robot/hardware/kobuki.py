@@ -16,7 +16,6 @@ from relmm.robot.hardware import clock
 from relmm.robot.hardware.kobuki_protocol import (
     BATTERY_FULL,
     PERIOD_S,
-    STOP,
     Feedback,
     FrameReader,
     Output,
@@ -37,6 +36,7 @@ ALIVE_S = 0.5  # s without a packet after which a base counts as lost; the drive
 _START_S = 5.0  # s to wait for its first packet
 _MAX_ACCELERATION = (2.2, 600.0)  # m/s^2 and deg/s^2, as in the simulation
 _MAX_BACKWARDS = 0.15  # m/s, blind
+_COASTING_S = 0.3  # that it takes to stand still
 _CHUNK = 65_536
 _DRIVING, _STANDING = Output.POWER | Output.LED1_GREEN | Output.LED2_GREEN, Output.POWER | Output.LED1_GREEN
 _STOPPED = Output.POWER | Output.LED1_RED | Output.LED2_RED
@@ -52,7 +52,7 @@ class BaseState:
         travelled: m since the start; backwards counts negative.
         heading: degrees since the start, positive = left, not wrapped.
         bumper, cliff, wheel_drop, over_current, charger, buttons: as `Feedback`, of the last packet.
-        battery: V.
+        battery: V, smoothed over a second: it drops for a moment when the motors start.
         bumped: bits of the bumper that were pressed at any time since `Kobuki.forget_bumps`.
         firmware: its version, None before it has told.
     """
@@ -82,7 +82,7 @@ class Kobuki:
     Args:
         port: its device.
         wheel_scale: true distance by the one its encoders tell.
-        dry: only listen; nothing is sent.
+        dry: the base is told to stand still, whatever it should do.
     """
 
     def __init__(self, port: str, wheel_scale: float = 1.0, dry: bool = False) -> None:
@@ -92,6 +92,7 @@ class Kobuki:
         self._state, self._odometry, self._reader = BaseState(), Odometry(wheel_scale), FrameReader()
         self._goal, self._expires = (0.0, 0.0), 0.0  # m/s and deg/s
         self._velocity = (0.0, 0.0)
+        self._moved = float("-inf")  # when it was last told to move
         self._blocked = False  # whether the goal was dropped because of what the base met
         self._extra = [request_versions()]  # sub-payloads to send once
         self._open = True
@@ -110,10 +111,17 @@ class Kobuki:
         while self.state().packets == 0:
             if clock.now() > until:
                 raise RobotError(
-                    f"The base does not answer on {self.port}: switch it on, plug it in, or say another --robot.base_port "
-                    "(relmm-doctor --robot.type=locobot looks for it)."
+                    f"The base does not answer on {self.port}: switch it on, plug it in, or say another "
+                    "--robot.base_port (relmm-doctor --robot.type=locobot looks for it)."
                 )
             clock.sleep(PERIOD_S)
+
+    def firmware(self) -> tuple[int, int, int] | None:
+        """Version of its firmware, which it was asked for; None if it does not tell within a second."""
+        until = clock.now() + 1.0
+        while self.state().firmware is None and clock.now() < until:
+            clock.sleep(PERIOD_S)
+        return self.state().firmware
 
     def state(self) -> BaseState:
         """What it told last."""
@@ -194,7 +202,7 @@ class Kobuki:
         if before.packets and now - before.time > ALIVE_S:
             self._odometry.forget_position()  # it may have been switched off, and counts from 0 again
             self._extra.append(request_versions())
-        self._odometry.update(feedback)
+        self._odometry.update(feedback, now - self._moved < _COASTING_S)
         self._state = BaseState(
             packets=before.packets + 1,
             time=now,
@@ -206,7 +214,7 @@ class Kobuki:
             over_current=feedback.over_current,
             charger=feedback.charger,
             buttons=feedback.buttons,
-            battery=feedback.battery,
+            battery=_smoothed(before, feedback.battery),
             bumped=before.bumped | feedback.bumper,
             firmware=feedback.firmware or before.firmware,
         )
@@ -236,11 +244,12 @@ class Kobuki:
         self._goal = self._velocity = (0.0, 0.0)
 
     def _send_command(self) -> None:
-        if self._dry:
-            return
         moving = self._velocity != (0.0, 0.0)
+        if moving:
+            self._moved = clock.now()
         lights = _STOPPED if self._blocked else _DRIVING if moving else _STANDING
-        command = frame(base_control(self._velocity[0], math.radians(self._velocity[1])), general_output(lights), *self._extra)
+        control = base_control(self._velocity[0], math.radians(self._velocity[1]))
+        command = frame(base_control(0.0, 0.0) if self._dry else control, general_output(lights), *self._extra)
         try:
             self._program.send(command)
             self._extra.clear()
@@ -265,6 +274,10 @@ class Kobuki:
         with self._lock:
             self._halt()
             self._program, self._guard = self._start_guard()
+
+
+def _smoothed(before: BaseState, battery: float) -> float:
+    return before.battery + (battery - before.battery) * PERIOD_S if before.packets else battery
 
 
 def _clamp(value: float, low: float, high: float) -> float:

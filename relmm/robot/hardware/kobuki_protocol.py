@@ -22,8 +22,8 @@ WHEELBASE = 0.230  # m
 TICKS_PER_TURN = 52 * 6545 / 132  # of a wheel: 52 of the motor, times the gear
 M_PER_TICK = 2 * math.pi * 0.035 / TICKS_PER_TURN
 
-# V. Below the first the driver of the manufacturer warns, below the second it calls the battery dangerously empty.
-BATTERY_FULL, BATTERY_LOW, BATTERY_EMPTY = 16.5, 14.0, 13.2
+# V. Below LOW the manufacturer's driver warns, below EMPTY it calls the battery dangerously empty; CHARGED is ours.
+BATTERY_FULL, BATTERY_CHARGED, BATTERY_LOW, BATTERY_EMPTY = 16.5, 16.0, 14.0, 13.2
 
 _HEADER = b"\xaa\x55"
 _MIN_PAYLOAD, _MAX_PAYLOAD = 3, 160  # bytes; the base's largest is 124, and a false length must not hide what follows
@@ -118,7 +118,6 @@ def general_output(output: int) -> bytes:
 def request_versions() -> bytes:
     """Ask for hardware version, firmware version and unique id."""
     return _sub_payload(Command.REQUEST_EXTRA, struct.pack("<H", 0x01 | 0x02 | 0x08))
-
 
 
 def velocity(control: bytes) -> tuple[float, float]:
@@ -225,8 +224,8 @@ class FrameReader:
                 start += 1  # a header may follow in what was taken for a frame
             elif end >= len(buffer):
                 break
-            elif _checksum(buffer[start + 2 : end]) == buffer[end] and _is_tiled(payload := bytes(buffer[start + 3 : end])):
-                yield payload
+            elif _is_frame(buffer[start + 2 : end + 1]):
+                yield bytes(buffer[start + 3 : end])
                 start = end + 1
             else:
                 start += 1
@@ -234,8 +233,13 @@ class FrameReader:
         del buffer[: start if start >= 0 else len(buffer) - buffer.endswith(_HEADER[:1])]
 
 
-def _is_tiled(payload: bytes) -> bool:
-    """Whether sub-payloads fill a payload exactly. The check sum alone lets every 256th piece of noise through."""
+def _is_frame(body: bytearray) -> bool:
+    """Whether length, payload and check sum fit together. The sum alone lets every 256th piece of noise through."""
+    return _checksum(body[:-1]) == body[-1] and _is_tiled(body[1:-1])
+
+
+def _is_tiled(payload: bytearray) -> bool:
+    """Whether sub-payloads fill a payload exactly."""
     start = 0
     while start + 2 <= len(payload):
         start += 2 + payload[start + 1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 from relmm.errors import RobotError
@@ -45,6 +46,11 @@ class Locobot(LocobotRobot):
         """
         raise RobotError("Calibrate a LoCoBot with relmm-calibrate --robot.type=locobot, which guides you through it.")
 
+    def take_measured(self, calibration: Calibration) -> None:
+        """Use another calibration from the next connection on, and save it."""
+        self.measured = calibration
+        self._save_calibration()
+
     def _load_calibration(self, fpath: Path | None = None) -> None:
         self.measured = load_calibration(fpath or self.calibration_fpath)
 
@@ -77,7 +83,7 @@ class Locobot(LocobotRobot):
             base = Kobuki(base_port, measured.wheel_scale, config.dry_run)
             opened.callback(base.close)
             base.wait_until_there()
-            arm = WidowX(arm_port, measured.sag_array(), measured.closed_opening, config.dry_run)
+            arm = WidowX(arm_port, measured.sag_array(), measured.closed_opening, measured.arm_delay, config.dry_run)
             opened.callback(arm.close)
             camera = D435(serial_number, view, measured.camera_pitch, measured.latency)
             opened.callback(camera.close)
@@ -85,6 +91,17 @@ class Locobot(LocobotRobot):
             body.start()
             opened.pop_all()
         return body
+
+    @property
+    def needs_charging(self) -> bool:
+        """See `LocobotRobot`."""
+        return self.body.needs_charging
+
+    def await_charge(self, should_stop: Callable[[], bool]) -> None:
+        """See `LocobotRobot`."""
+        self.body.await_charge(should_stop)
+        self.skills.rest()
+        self.skills.forget_picture()
 
     @property
     def body(self) -> LocobotBody:

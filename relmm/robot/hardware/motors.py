@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.motors import Motor, MotorNormMode
 from lerobot.motors.dynamixel import DynamixelMotorsBus
@@ -91,6 +92,10 @@ def to_radians(ticks: float) -> float:
     return (ticks - MIDDLE) * RADIANS_PER_TICK
 
 
+def _with_double[Entry](table: dict[str, Entry]) -> dict[str, Entry]:
+    return {**table, _DOUBLE_XL430: table[_XL430]}
+
+
 class LocobotMotorsBus(DynamixelMotorsBus):
     """LeRobot's bus, which also knows the double motor under the camera.
 
@@ -100,11 +105,12 @@ class LocobotMotorsBus(DynamixelMotorsBus):
     """
 
     default_timeout = 100  # ms; at 1 Mbaud an answer takes less than one
-    model_encoding_table = {**MODEL_ENCODING_TABLE, _DOUBLE_XL430: MODEL_ENCODING_TABLE[_XL430]}
-    model_resolution_table = {**MODEL_RESOLUTION, _DOUBLE_XL430: MODEL_RESOLUTION[_XL430]}
-    model_number_table = {**MODEL_NUMBER_TABLE, _DOUBLE_XL430: 1090}
-    model_ctrl_table = {**MODEL_CONTROL_TABLE, _DOUBLE_XL430: MODEL_CONTROL_TABLE[_XL430]}
-    model_baudrate_table = {**MODEL_BAUDRATE_TABLE, _DOUBLE_XL430: MODEL_BAUDRATE_TABLE[_XL430]}
+    # The motors of a 2XL430 are XL430 under another number.
+    model_encoding_table: ClassVar[dict[str, dict[str, int]]] = _with_double(MODEL_ENCODING_TABLE)
+    model_resolution_table: ClassVar[dict[str, int]] = _with_double(MODEL_RESOLUTION)
+    model_number_table: ClassVar[dict[str, int]] = {**MODEL_NUMBER_TABLE, _DOUBLE_XL430: 1090}
+    model_ctrl_table: ClassVar[dict[str, dict[str, tuple[int, int]]]] = _with_double(MODEL_CONTROL_TABLE)
+    model_baudrate_table: ClassVar[dict[str, dict[int, int]]] = _with_double(MODEL_BAUDRATE_TABLE)
 
     def __init__(self, port: str, names: tuple[str, ...] = tuple(JOINTS)) -> None:
         motors = {name: Motor(JOINTS[name].id, JOINTS[name].model, MotorNormMode.DEGREES) for name in names}
@@ -114,6 +120,14 @@ class LocobotMotorsBus(DynamixelMotorsBus):
         self.port_handler.clearPort = lambda: self.port_handler.ser.reset_input_buffer()
 
     def ping(self, motor: str | int, num_retry: int = 2, raise_on_error: bool = False) -> int | None:
-        """As LeRobot's, which counts a motor as missing when one answer was lost."""
-        model: int | None = super().ping(motor, num_retry, raise_on_error)
-        return model
+        """Model of a motor, None if it is silent.
+
+        LeRobot's counts a motor as missing when one answer was lost, or when the motor reports an error of its own.
+        """
+        for _ in range(1 + num_retry):
+            model, result, _ = self.packet_handler.ping(self.port_handler, self._get_motor_id(motor))
+            if self._is_comm_success(result):
+                return int(model)
+        if raise_on_error:
+            raise ConnectionError(f"Motor {motor} is silent.")
+        return None

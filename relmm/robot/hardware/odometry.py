@@ -7,13 +7,13 @@ import math
 from relmm.robot.hardware.kobuki_protocol import M_PER_TICK, WHEELBASE, Feedback
 
 _TURN = 65_536  # at which encoders wrap
-_STILL_RATE = 1.0  # deg/s; what the gyro tells of a standing robot is less, and would add up
 
 
 class Odometry:
     """Adds up encoder ticks and gyro angles, which wrap.
 
-    The gyro tells turns: wheels slip. While nothing moves its drift is left out.
+    The gyro tells how far the base has turned while it drives: wheels slip. While it stands, the wheels tell, which do
+    not drift, and which move when something pushes the base.
 
     Args:
         wheel_scale: true distance by the one that the encoders tell, from the calibration.
@@ -29,8 +29,8 @@ class Odometry:
         self.travelled = 0.0
         self.heading = 0.0
 
-    def update(self, feedback: Feedback) -> None:
-        """Take in one reading of the base."""
+    def update(self, feedback: Feedback, driving: bool) -> None:
+        """Take in one reading of the base; `driving` if it is told to move, or was a moment ago."""
         last, self._last = self._last, feedback
         if last is None:
             return
@@ -39,10 +39,10 @@ class Odometry:
             for now, before in ((feedback.left, last.left), (feedback.right, last.right))
         )
         self.travelled += (left + right) / 2
-        if feedback.angle is None or last.angle is None:
-            self.heading += math.degrees((right - left) / WHEELBASE)
-        elif left or right or abs(feedback.rate or 0.0) > _STILL_RATE:
+        if driving and feedback.angle is not None and last.angle is not None:
             self.heading += wrapped(feedback.angle - last.angle, 360.0)
+        else:
+            self.heading += math.degrees((right - left) / WHEELBASE)
 
     def forget_position(self) -> None:
         """Go on from the next reading: the base was switched off, and its counters begin anew."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import termios
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from relmm.errors import RobotError
 from relmm.features import FloatArray
+from relmm.geometry import arm_forward
 from relmm.robot.body import MAX_OPENING
 from relmm.robot.hardware import clock
 from relmm.robot.hardware.arm_safety import check_way
@@ -36,6 +38,7 @@ MAX_TEMPERATURE = 70  # degrees Celsius; the motors switch themselves off at 72 
 _SAME_AXLE = 20  # ticks between the two motors of the shoulder
 _LAY_DOWN_S, _HEAD_S = 2.5, 1.0
 _HEALTH_S = 0.5  # between looks at errors and temperatures
+_GOALS = 10  # looks that are remembered, some 0.4 s
 _RETRIES = 2  # of a read or write whose answer was lost
 ERRORS = {1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload"}
 
@@ -46,7 +49,7 @@ class ArmState:
 
     Attributes:
         joints: rad, shape (5,).
-        goal: rad, where the motors' profiles are at this moment, shape (5,).
+        goal: rad, where the motors' profiles say that the joints are at this moment, shape (5,).
         opening: m, between the finger pads.
     """
 
@@ -60,14 +63,19 @@ class WidowX:
 
     Args:
         port: of the adapter of its motors.
-        sag: rad by which each joint hangs below its goal, per rad of goal error that it is asked to make up for; from
-            the calibration, shape (5,).
+        sag: rad that each joint is lifted with the arm stretched out level, because it hangs; from the calibration,
+            shape (5,).
         closed_opening: m that the gripper tells when its pads touch, from the calibration.
+        delay: s that the joints trail behind the motors' profiles, from the calibration.
         dry: only listen; nothing moves.
     """
 
-    def __init__(self, port: str, sag: FloatArray, closed_opening: float = 0.0, dry: bool = False) -> None:
+    def __init__(
+        self, port: str, sag: FloatArray, closed_opening: float = 0.0, delay: float = 0.0, dry: bool = False
+    ) -> None:
         self.port, self._sag, self._closed, self._dry = port, sag, closed_opening, dry
+        self._delay = delay
+        self._goals: deque[tuple[float, FloatArray]] = deque(maxlen=_GOALS)
         self._gripper = GripperControl()
         self._pwm = 0
         self._next_health = float("-inf")
@@ -86,8 +94,8 @@ class WidowX:
         ticks = self._read("Present_Position", ("shoulder", SHADOW))
         if abs(ticks["shoulder"] - ticks[SHADOW]) > _SAME_AXLE and self._configured(SHADOW):
             raise RobotError(
-                f"The two motors of the shoulder (2 and 3) disagree by {abs(ticks['shoulder'] - ticks[SHADOW])} of 4096 "
-                "ticks, and would fight: set the Homing_Offset of motor 3 so that both tell the same position."
+                f"The two motors of the shoulder (2 and 3) disagree by {abs(ticks['shoulder'] - ticks[SHADOW])} of "
+                "4096 ticks, and would fight: set the Homing_Offset of motor 3 so that both tell the same position."
             )
         for name in JOINTS:
             self._set_up(name)
@@ -142,7 +150,17 @@ class WidowX:
         present = self._read("Present_Position", (*ARM, GRIPPER))
         goal = self._read("Position_Trajectory", ARM)
         joints, asked = self._angles(present), self._angles(goal)
-        return ArmState(joints, asked - self._lift(asked), self._opening(present[GRIPPER]))
+        return ArmState(joints, self._trailing(asked - self._lift(asked)), self._opening(present[GRIPPER]))
+
+    def _trailing(self, goal: FloatArray) -> FloatArray:
+        """Where the profiles were as long ago as the joints trail behind them."""
+        now = clock.now()
+        self._goals.append((now, goal))
+        times = [time for time, _ in self._goals]
+        return np.array([np.interp(now - self._delay, times, joint) for joint in zip(*self._last_goals(), strict=True)])
+
+    def _last_goals(self) -> list[FloatArray]:
+        return [goal for _, goal in self._goals]
 
     def _angles(self, ticks: dict[str, int]) -> FloatArray:
         return np.array([to_radians(ticks[name]) * (-1 if name in self._mirrored else 1) for name in ARM])
@@ -181,8 +199,8 @@ class WidowX:
         for name, temperature in self._read("Present_Temperature", names).items():
             if temperature > MAX_TEMPERATURE:
                 raise RobotError(
-                    f"Motor {JOINTS[name].id} ({name}) is at {temperature} degrees C, and {MAX_TEMPERATURE} are allowed: "
-                    "let it cool down."
+                    f"Motor {JOINTS[name].id} ({name}) is at {temperature} degrees C, and {MAX_TEMPERATURE} are "
+                    "allowed: let it cool down."
                 )
 
     # --- Moving ------------------------------------------------------------------------------------------
@@ -213,7 +231,7 @@ class WidowX:
 
     def _lift(self, joints: FloatArray) -> FloatArray:
         """By how much the goal has to be higher than where the arm is to be, because it hangs; rad, shape (5,)."""
-        return self._sag * _load(joints)
+        return self._sag * load_of(joints)
 
     def look(self, pan: float, tilt: float) -> None:
         """Turn the camera (rad)."""
@@ -290,16 +308,14 @@ def _open_bus(port: str) -> LocobotMotorsBus:
         raise RobotError("The arm needs dynamixel-sdk: pip install 'lerobot_policy_relmm[hardware]'.") from error
     except (ConnectionError, OSError, RuntimeError, termios.error, IndexError) as error:
         raise RobotError(
-            f"Not all motors of the arm answer on {port} ({_first_line(error)}): switch the robot on, check the cable, or "
-            "say another --robot.arm_port; relmm-doctor --robot.type=locobot asks every motor."
+            f"Not all motors of the arm answer on {port} ({_first_line(error)}): switch the robot on, check the cable, "
+            "or say another --robot.arm_port; relmm-doctor --robot.type=locobot asks every motor."
         ) from error
     return bus
 
 
-def _load(joints: FloatArray) -> FloatArray:
+def load_of(joints: FloatArray) -> FloatArray:
     """What gravity does to each joint, as a share of what it does to the arm stretched out level; shape (5,)."""
-    from relmm.geometry import arm_forward
-
     corners = arm_forward(joints)
     forward = np.array([np.cos(joints[0]), np.sin(joints[0])])
     reach = (corners[:, :2] - corners[0, :2]) @ forward  # m, of elbow, wrist and tool, before the shoulder

@@ -51,11 +51,11 @@ class Emulated:
             f"--robot.calibration_dir={folder}/calibration",
         ]
 
-    def collected(self) -> int:
-        """Objects in its basket, by the simulator."""
-        self.process.stdin.write("count\n")
+    def put(self, x: float, y: float) -> None:
+        """Lay the first object down as a person would; m, robot frame."""
+        self.process.stdin.write(f"put {x} {y}\n")
         self.process.stdin.flush()
-        return int(self.process.stdout.readline())
+        assert self.process.stdout.readline() == "put\n"
 
 
 @pytest.fixture
@@ -68,7 +68,10 @@ def emulate(tmp_path: Path) -> Iterator[Callable[..., Emulated]]:
         folder.mkdir()
         command = [sys.executable, str(HERE / "emulated_locobot.py"), str(folder), room]
         process = subprocess.Popen(
-            [*command, str(num_objects), str(seed), str(speed)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [*command, str(num_objects), str(seed), str(speed)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         running.append(process)
         assert process.stdout.readline() == "ready\n"

@@ -1,4 +1,4 @@
-"""The Dynamixel chain of a LoCoBot speaking protocol 2.0, written from the X series' e-manual and not from relmm's driver.
+"""The Dynamixel chain of a LoCoBot speaking protocol 2.0, written from the e-manual and not from relmm's driver.
 
 Positions are those that a motor tells: 4096 to a turn, 2048 in the middle. Which way a joint turns for them depends on
 how the motor is mounted and on its drive mode, as on the robot.
@@ -100,7 +100,7 @@ class Motor:
             return ACCESS
         before = bytes(self.table)
         self.table[address:end] = data
-        if address <= GOAL[0] < end and not self.get(OPERATING_MODE) == PWM_MODE:
+        if address <= GOAL[0] < end and self.get(OPERATING_MODE) != PWM_MODE:
             goal = self.get(GOAL, signed=True)
             if not self.get(MIN_POSITION) <= goal <= self.get(MAX_POSITION):
                 self.table[:] = before

@@ -16,6 +16,7 @@ import time
 from multiprocessing.connection import Connection, Listener
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from dynamixel_emulator import GOAL_PWM, DynamixelEmulator, locobot_motors
 from emulated_time import SharedTime
@@ -25,7 +26,7 @@ from relmm.geometry import CAMERAS, CameraGeometry
 from relmm.robot.body import MAX_OPENING
 from relmm.robot.hardware.gripper import angle_of
 from relmm.sim.body import SimBody
-from relmm.sim.rooms import make_room
+from relmm.sim.rooms import make_room, set_object
 
 sys.path.insert(0, str(Path(__file__).parent / "fakes"))
 from pyrealsense2 import INTRINSICS
@@ -64,6 +65,7 @@ class EmulatedLocobot:
         self._heading = self.body.truth.robot()[2]
         self._turned = 0.0
         self._gripper_pwm = 0
+        self.person: queue.SimpleQueue[tuple[float, float]] = queue.SimpleQueue()
         self.time = SharedTime(folder / "time")
         motors = locobot_motors()
         self.base = KobukiEmulator(folder / "kobuki", plant=self, threaded=False)
@@ -73,9 +75,20 @@ class EmulatedLocobot:
         self._listener = Listener(str(folder / "camera"), "AF_UNIX")
         threading.Thread(target=self._listen, daemon=True).start()
 
+    def _let_person_act(self) -> None:
+        while not self.person.empty():
+            x, y = self.person.get()
+            robot_x, robot_y, heading = self.body.truth.robot()
+            cos, sin = math.cos(heading), math.sin(heading)
+            place = (robot_x + cos * x - sin * y, robot_y + sin * x + cos * y, heading)
+            set_object(self.body.model, self.body.data, 0, place)
+            mujoco.mj_forward(self.body.model, self.body.data)
+            print("put", flush=True)
+
     def run(self, stopped: threading.Event) -> None:
         due = time.monotonic()
         while not stopped.is_set():
+            self._let_person_act()
             if self.speed:
                 self._tick()
                 self._show_pictures()
@@ -123,7 +136,10 @@ class EmulatedLocobot:
         with self.chain.lock:
             now, motors = self.chain.now(), self.chain.motors
             goal = np.array(
-                [motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else motors[i].angle for i in ARM_IDS]
+                [
+                    motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else motors[i].angle
+                    for i in ARM_IDS
+                ]
             )
             for head in (10, 11):
                 motors[head].step(now, PERIOD_S)
@@ -180,11 +196,14 @@ def main() -> None:
     folder, room, num_objects, seed, speed = sys.argv[1:]
     robot = EmulatedLocobot(Path(folder), room, int(num_objects), int(seed), float(speed))
     stopped = threading.Event()
+    asked: queue.SimpleQueue[tuple[float, float]] = queue.SimpleQueue()
+    robot.person = asked
 
     def wait_for_end() -> None:
         for line in sys.stdin:
-            if line.strip() == "count":
-                print(int(robot.body.truth.in_basket().sum()), flush=True)
+            order, *numbers = line.split()
+            if order == "put":  # as a person: object 0 at x, y in the robot's frame, or out of the way
+                asked.put(tuple(map(float, numbers)))
         stopped.set()
 
     threading.Thread(target=wait_for_end, daemon=True).start()

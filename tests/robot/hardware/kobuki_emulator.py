@@ -1,7 +1,7 @@
 """A Kobuki at the level of bytes, written from its protocol specification and not from relmm's driver.
 
-    from kobuki_emulator import KobukiEmulator
-    with KobukiEmulator(tmp_path / "kobuki") as base: ...
+from kobuki_emulator import KobukiEmulator
+with KobukiEmulator(tmp_path / "kobuki") as base: ...
 """
 
 from __future__ import annotations
@@ -151,7 +151,10 @@ class KobukiEmulator:
 
     def _feedback(self) -> bytes:
         left, right, heading, bumper = self.plant.sensors()
-        ticks = [(first + round(m * TICKS_PER_METRE)) % 65536 for first, m in zip(self.first_tick, (left, right))]
+        ticks = [
+            (first + round(m * TICKS_PER_METRE)) % 65536
+            for first, m in zip(self.first_tick, (left, right), strict=False)
+        ]
         angle = (round(heading * 100) + 18000) % 36000 - 18000
         basic = struct.pack(
             "<HBBBHHbbBBBB",

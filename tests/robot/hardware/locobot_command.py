@@ -1,6 +1,6 @@
 """Runs a command of relmm or LeRobot on an emulated LoCoBot whose time passes only while the command sleeps.
 
-    python locobot_command.py FOLDER MODULE ARGUMENT...
+python locobot_command.py FOLDER MODULE ARGUMENT...
 """
 
 import sys

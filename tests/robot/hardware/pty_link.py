@@ -1,7 +1,8 @@
-"""A serial cable for emulators: a pseudo-terminal behind a link such as /dev/serial/by-id has, to unplug and plug in."""
+"""A serial cable for emulators: a pseudo-terminal behind a link as in /dev/serial/by-id, to unplug and plug in."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import tty
@@ -46,10 +47,8 @@ class Cable:
 
     def write(self, data: bytes) -> None:
         if self.plugged:
-            try:
+            with contextlib.suppress(BlockingIOError):  # nobody reads: a serial line loses what is not taken
                 os.write(self._master, data)
-            except BlockingIOError:
-                pass  # nobody reads: a serial line loses what its reader does not take
 
     def fileno(self) -> int:
         return self._master

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
-import numpy as np
 import pytest
 
 pytest.importorskip("serial", reason="pyserial is not installed (the extra `hardware`)")
 pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
 
-from relmm.features import ACTION_NAMES, MAX_THETA_VEL, MAX_X_VEL, Skill, action_dict, cell_to_xy
+from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
 from relmm.robot.hardware.config_locobot import LocobotConfig
 from relmm.robot.hardware.locobot import Locobot
 from relmm.sim.config_locobot_sim import LocobotSimConfig
@@ -60,8 +56,8 @@ def test_robot_drives_and_turns_as_told(robot):
 @pytest.mark.parametrize("robot", [{"num_objects": 60}], indirect=True)
 def test_robot_picks_something_up(robot):
     """By the scripted policy's own eyes, which know nothing of what is behind the bytes."""
-    from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
     from relmm.commands.policies import make_actor
+    from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
 
     actor = make_actor(RelmmScriptedConfig(device="cpu"))
     for _ in range(40):

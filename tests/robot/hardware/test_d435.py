@@ -95,6 +95,11 @@ def test_pictures_are_newer_than_the_question(realsense):
     assert realsense.started == 0, "the pipeline is stopped"
 
 
+def capture_often(camera: D435) -> None:
+    for _ in range(3):
+        camera.capture()
+
+
 # LeRobot's thread ends with an exception after ten failures.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_unplugged_camera_is_one_sentence(realsense):
@@ -107,8 +112,7 @@ def test_unplugged_camera_is_one_sentence(realsense):
     realsense.source = gone
     try:
         with pytest.raises(RobotError, match="The camera sends no pictures: check its cable"):
-            for _ in range(3):
-                camera.capture()
+            capture_often(camera)
         assert not camera.alive
     finally:
         camera.close()
@@ -123,5 +127,5 @@ def test_none_or_several_cameras_are_one_sentence(realsense, monkeypatch, number
 
 def test_machine_without_pyrealsense2_is_told_what_to_do(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyrealsense2", None)
-    with pytest.raises(RobotError, match="needs pyrealsense2 .* build librealsense"):
+    with pytest.raises(RobotError, match=r"needs pyrealsense2 .* build librealsense"):
         D435(None, VIEW, VIEW.pitch, latency=0.0)

@@ -97,7 +97,8 @@ def test_arm_moves_on_a_smooth_profile_and_shows_its_goal(chain, arm):
     arm.move(REST_POSE, 0.5)
     time.sleep(0.25)
     middle = arm.state()
-    assert 0.02 < np.abs(middle.goal - SLEEP_POSE).max() and np.abs(middle.goal - REST_POSE).max() > 0.02
+    assert np.abs(middle.goal - SLEEP_POSE).max() > 0.02
+    assert np.abs(middle.goal - REST_POSE).max() > 0.02
     time.sleep(0.45)
     state = arm.state()
     assert state.joints == pytest.approx(REST_POSE, abs=0.01)
@@ -118,7 +119,7 @@ def test_shadow_obeys_its_own_motor_only(chain, arm):
     [
         (np.array([0.0, 0.0, 0.0, 9.0, 0.0]), "beyond its limits"),
         (arm_inverse(0.40, 0.0, 0.0, math.pi / 2), "the floor"),
-        (arm_inverse(0.38, 0.0, 0.014, math.pi / 2) + [0, 0.3, 0, 0, 0], "the floor"),
+        (arm_inverse(0.38, 0.0, 0.014, math.pi / 2) + np.array([0, 0.3, 0, 0, 0]), "the floor"),
         (np.array([math.pi, 0.9, 0.5, 0.5, 0.0]), "the robot itself|the floor"),
     ],
 )
@@ -236,13 +237,13 @@ def test_missing_motor_is_one_sentence(tmp_path):
 
 
 def test_no_adapter_is_one_sentence(tmp_path):
-    with pytest.raises(RobotError, match="Not all motors of the arm answer on .*/nothing"):
+    with pytest.raises(RobotError, match=r"Not all motors of the arm answer on .*/nothing"):
         WidowX(str(tmp_path / "nothing"), np.zeros(5))
 
 
 def test_arm_that_loses_power_is_one_sentence(chain, arm):
     chain.powered = False
-    with pytest.raises(RobotError, match="The arm does not answer on .*: check its power and cable"):
+    with pytest.raises(RobotError, match=r"The arm does not answer on .*: check its power and cable"):
         arm.state()
 
 
@@ -257,7 +258,7 @@ def test_late_answer_is_not_taken_for_the_next_one(chain, arm):
 
 def test_arm_that_is_unplugged_is_one_sentence(chain, arm):
     chain.cable.unplug()
-    with pytest.raises(RobotError, match="The arm does not answer on .*: check its power and cable"):
+    with pytest.raises(RobotError, match=r"The arm does not answer on .*: check its power and cable"):
         arm.state()
 
 

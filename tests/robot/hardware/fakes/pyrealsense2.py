@@ -155,7 +155,9 @@ class pipeline:
 
     def start(self, settings: config) -> pipeline_profile:
         global started
-        if not plugged or settings.serial not in [d.get_info(camera_info.serial_number) for d in context().query_devices()]:
+        if not plugged or settings.serial not in [
+            d.get_info(camera_info.serial_number) for d in context().query_devices()
+        ]:
             raise RuntimeError("No device connected")
         assert settings.streams[stream.color] == (640, 480, format.rgb8, 30)
         assert settings.streams[stream.depth] == (640, 480, format.z16, 30)
