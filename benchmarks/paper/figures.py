@@ -25,16 +25,23 @@ def draw_scores(path: Path) -> Path:
     for row in read(path):
         curves[row["experiment"].split("/", 1)[1]][int(row["step"])].append(100 * float(row["collected"]))
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    single = all(len(each) == 1 for each in curves.values())
     for index, (name, points) in enumerate(curves.items()):
         steps = sorted(points)
         means, stds = (np.array([f(points[step]) for step in steps]) for f in (np.mean, np.std))
-        if max(len(each) for each in curves.values()) == 1:
-            axes.bar(index, means, yerr=stds, label=name, capsize=3)
+        if single:
+            bar = axes.bar(index, means, 0.5, yerr=stds, color="tab:blue", capsize=3)
+            axes.bar_label(bar, fmt="%.0f", label_type="center", color="white")
         else:
             (line,) = axes.plot(steps, means, marker="o", label=f"{name} ({len(points[steps[0]])} seeds)")
             axes.fill_between(steps, means - stds, means + stds, color=line.get_color(), alpha=0.15)
-    axes.set(title=path.stem, ylabel="objects collected, %", ylim=(0, 102), xlabel="navigation steps")
-    axes.legend(fontsize=8)
+    axes.set(title=path.stem, ylabel="objects collected, %", ylim=(0, 102))
+    if single:
+        seeds = [f"{name}\n{len(next(iter(points.values())))} seed(s)" for name, points in curves.items()]
+        axes.set_xticks(range(len(curves)), seeds, fontsize=8)
+    else:
+        axes.set_xlabel("navigation steps")
+        axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
     return _saved(figure, path.with_suffix(".png"))
 

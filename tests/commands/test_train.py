@@ -211,7 +211,10 @@ def test_policy_is_the_one_that_anything_names_or_the_default(tmp_path, monkeypa
 
 def test_config_path_that_is_neither_file_nor_preset_is_refused(tmp_path, refused, tiny):
     words = refused(*tiny, "--config_path=nonsense", f"--output_dir={tmp_path / 'run'}")
-    assert "--config_path=nonsense: there is no such file; choose one, or a preset: paper, paper_small." in words
+    assert (
+        "--config_path=nonsense: there is no such file; choose one, or a preset: paper, paper_small, paper_continuous."
+        in words
+    )
 
 
 def test_no_run_to_resume_is_said_before_what_it_would_have_known(tmp_path, refused):

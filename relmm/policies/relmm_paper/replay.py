@@ -44,22 +44,28 @@ class Pictures:
     """The newest pictures; each has a number, counted from the first.
 
     Args:
-        capacity: how many; one takes 30 kB, but no memory until it is written to.
+        capacity: how many; one takes 30 kB.
     """
 
     def __init__(self, capacity: int) -> None:
-        self._pictures = np.empty((capacity, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-        self._added = 0
+        self._capacity, self._added = capacity, 0
+        self._pictures: list[Picture] = []  # one by one: an array for all of them may not fit into memory
 
     def add(self, picture: Picture) -> int:
         """Take one, (100, 100, 3); its number."""
         number, self._added = self._added, self._added + 1
-        self._pictures[number % len(self._pictures)] = picture
+        if number < self._capacity:
+            self._pictures.append(picture.copy())
+        else:
+            self._pictures[number % self._capacity][:] = picture
         return number
 
     def __getitem__(self, numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
         """By number, (n, 100, 100, 3)."""
-        return self._pictures[numbers % len(self._pictures)]
+        pictures = np.empty((len(numbers), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+        for row, number in enumerate(numbers.tolist()):
+            pictures[row] = self._pictures[number % self._capacity]
+        return pictures
 
 
 class Steps:
