@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from dynamixel_emulator import GOAL_PWM, DynamixelEmulator, locobot_motors
 from emulated_time import SharedTime
-from kobuki_emulator import KobukiEmulator
+from kobuki_emulator import TRACK, KobukiEmulator
 
 from relmm.geometry import CAMERAS, CameraGeometry
 from relmm.robot.body import MAX_OPENING
@@ -118,8 +118,10 @@ class EmulatedLocobot:
 
     # --- What the base moves -----------------------------------------------------------------------------
     def step(self, seconds: float, x_vel: float, theta_vel: float) -> None:
-        self.body._velocity = self.body._velocity_goal  # the driver has limited the acceleration already
-        self.body.drive(x_vel, math.degrees(theta_vel))
+        # Past the simulated body's own limits of acceleration, which are the driver's business here.
+        self.body._velocity = self.body._velocity_goal = (x_vel, math.degrees(theta_vel))
+        turn = theta_vel * TRACK / 2
+        self.body.data.ctrl[self.body._wheel_ctrl] = (x_vel - turn) / WHEEL_RADIUS, (x_vel + turn) / WHEEL_RADIUS
         self._obey()
         self.body.wait(seconds)
         self._publish()
