@@ -9,6 +9,7 @@ from lerobot.robots.config import RobotConfig
 
 from relmm.errors import MAX_SEED, check_range
 from relmm.geometry import camera_geometry
+from relmm.sim.realism import realism
 from relmm.sim.rooms import Room, make_room
 
 
@@ -23,6 +24,7 @@ class LocobotSimConfig(RobotConfig):
         seed: where the objects lie and which way the robot looks at first; None for that of the command, or 0.
         camera: `paper` (the authors' simulated camera) or `d435` (a RealSense D435 on the LoCoBot's tower).
         depth: whether observations hold the depth picture too.
+        realism: `none`, or `mild` or `harsh`: noise, light, wheels and delays as of a real robot, drawn anew by seed.
     """
 
     room: str = "no_obstacles"
@@ -30,10 +32,12 @@ class LocobotSimConfig(RobotConfig):
     seed: int | None = None
     camera: str = "paper"
     depth: bool = False
+    realism: str = "none"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         camera_geometry(self.camera)
+        realism(self.realism)
         check_range("robot.seed", self.seed or 0, 0, MAX_SEED)
         self.make_room().scatter(np.random.default_rng(0))  # says now if the objects do not fit
 
