@@ -148,10 +148,9 @@ class Imperfections:
         settings = self._settings
         measured = metres + self._rng.normal(0, 1, metres.shape) * settings.depth_noise / 1000 * metres**2
         if settings.depth_holes:
-            near: Any
-            far: Any
-            near, far = cv2.erode(metres, np.ones((3, 3))), cv2.dilate(metres, np.ones((3, 3)))
-            blobs = cv2.blur(self._rng.random(metres.shape), (_HOLE, _HOLE))
+            near: Any = cv2.erode(metres, np.ones((3, 3)))
+            far: Any = cv2.dilate(metres, np.ones((3, 3)))
+            blobs: Any = cv2.blur(self._rng.random(metres.shape), (_HOLE, _HOLE))
             holes = blobs < np.quantile(blobs, settings.depth_holes)
             measured = np.where(holes | (far - near > _EDGE / 1000), np.inf, measured)
         return np.asarray(measured)
