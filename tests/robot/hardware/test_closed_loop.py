@@ -21,8 +21,6 @@ from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
 from relmm.robot.hardware import clock
 from relmm.robot.hardware.config_locobot import LocobotConfig
 from relmm.robot.hardware.locobot import Locobot
-from relmm.sim.config_locobot_sim import LocobotSimConfig
-from relmm.sim.locobot_sim import LocobotSim
 
 HERE = Path(__file__).parent
 
@@ -47,14 +45,6 @@ def robot(emulate, realsense, monkeypatch, request):
     robot.connect()
     yield robot
     robot.disconnect()
-
-
-@pytest.mark.parametrize("depth", [False, True])
-def test_features_are_those_of_the_simulated_robot(tmp_path, depth):
-    real = Locobot(LocobotConfig(depth=depth, calibration_dir=tmp_path))
-    simulated = LocobotSim(LocobotSimConfig(depth=depth, camera="d435", calibration_dir=tmp_path))
-    assert list(real.observation_features.items()) == list(simulated.observation_features.items())
-    assert list(real.action_features.items()) == list(simulated.action_features.items())
 
 
 def test_robot_drives_and_turns_as_told(robot):
