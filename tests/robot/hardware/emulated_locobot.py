@@ -65,6 +65,7 @@ class EmulatedLocobot:
         self._heading = self.body.truth.robot()[2]
         self._turned = 0.0
         self._gripper_pwm = 0
+        self._lies = self.body.state().joints
         self.person: queue.SimpleQueue[tuple[float, float]] = queue.SimpleQueue()
         self.time = SharedTime(folder / "time")
         motors = locobot_motors()
@@ -139,10 +140,11 @@ class EmulatedLocobot:
             now, motors = self.chain.now(), self.chain.motors
             goal = np.array(
                 [
-                    motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else motors[i].angle
-                    for i in ARM_IDS
+                    motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else lies
+                    for i, lies in zip(ARM_IDS, self._lies, strict=True)
                 ]
             )
+            self._lies = goal  # a limp arm lies on the robot, and stays there
             for head in (10, 11):
                 motors[head].step(now, PERIOD_S)
             pwm = motors[7].get(GOAL_PWM, signed=True) if motors[7].torque else 0
