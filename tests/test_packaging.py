@@ -23,7 +23,7 @@ COMMANDS = sorted(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"
 REGISTERED = {
     "policy": {"relmm_scripted", "relmm_random"},
     "env": {"relmm_room"},
-    "robot": {"locobot_sim"},
+    "robot": {"locobot", "locobot_sim"},
     "teleop": {"locobot_scripted"},
 }
 DISCOVER = """

@@ -14,8 +14,10 @@ relmm-train: a robot is put into a room and learns to clean it.
   relmm-train --robot.type=locobot_sim --robot.room=no_obstacles
   relmm-train --output_dir=FOLDER --resume=true
 
+  --robot.type=locobot          a real robot, see docs/locobot.md
   --robot.room=NAME             no_obstacles, obstacles, diverse, obstacles_rugs
   --robot.num_objects=N         that lie about
+  --robot.realism=none          or mild, harsh: sensors, wheels and light as bad as real ones
   --policy.type=relmm           or relmm_paper: the paper's networks and soft actor-critic; or relmm_single
   --config_path=paper           or paper_small, paper_continuous: relmm_paper with the paper's numbers; or a file
   --policy.path=DIR             or user/repo[@revision]: go on from its weights

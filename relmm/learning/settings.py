@@ -27,7 +27,7 @@ _ROBOT = {"type": str}
 # What means the same on every machine: nothing that names a file or a device.
 _PORTABLE = {"curriculum", "eval", "steps", "seed", "env_eval_freq", "save_freq", "log_freq", "max_steps"}
 _PORTABLE |= {"pseudo_reset_steps", "replay_frames"}
-_PORTABLE_ROBOT = ("type", "room", "num_objects", "seed", "camera", "depth", "tidy_every")
+_PORTABLE_ROBOT = ("type", "room", "num_objects", "seed", "camera", "depth", "tidy_every", "realism")
 _ON_THE_HUB = re.compile(r"[\w.-]+/[\w.-]+(@\w+)?")  # not a folder of another machine
 
 

@@ -15,6 +15,7 @@ from relmm.robot.body import BUMPER_CENTRE, BUMPER_LEFT, BUMPER_RIGHT, MAX_OPENI
 from relmm.robot.skills import REST_POSE
 from relmm.sim.basket import Basket
 from relmm.sim.model import CAMERA_NAME, ROBOT, build_model
+from relmm.sim.realism import REALISM, Imperfections, Realism
 from relmm.sim.renderer import Renderer
 from relmm.sim.rooms import Room, set_object, set_objects
 from relmm.sim.truth import Truth
@@ -28,6 +29,7 @@ _WHEELS = ("wheel_left", "wheel_right")
 _MAX_DEPTH = 10.0  # m, the D435's range
 _SETTLE_S = 0.3
 _STILL = (0.0, 0.0)
+PERFECT = REALISM["none"]
 
 
 class SimBody:
@@ -36,14 +38,20 @@ class SimBody:
     Args:
         room: where the robot is put.
         camera: its camera.
+        imperfect: how bad its sensors and wheels are, see `relmm.sim.realism`.
     """
 
-    def __init__(self, room: Room, camera: CameraGeometry) -> None:
+    def __init__(self, room: Room, camera: CameraGeometry, imperfect: Realism = PERFECT) -> None:
         self.camera = camera
         self.room = room
         self.model = build_model(room, camera)
         self.data = mujoco.MjData(self.model)
         self.truth = Truth(self.model, self.data, room)
+        self._imperfections = (
+            None
+            if imperfect == PERFECT
+            else Imperfections(imperfect, self.model, ROBOT + CAMERA_NAME, self.truth.object_ids)
+        )
         self._basket = Basket(self.model, self.data, self.truth.object_ids)
         self._substeps = round(_CONTROL_S / self.model.opt.timestep)
         self._renderer: Renderer | None = None
@@ -75,6 +83,8 @@ class SimBody:
             *(np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)),
         ]
         set_objects(self.model, self.data, self.room.scatter(rng))
+        if self._imperfections is not None:
+            self._imperfections.begin(rng)
         self.data.qpos[self._arm_qpos] = REST_POSE
         self.data.qpos[self._fingers_qpos] = MAX_OPENING / 2
         self._forget_commands()
@@ -95,13 +105,19 @@ class SimBody:
         self._arm_times = (0.0, _CONTROL_S)
         # m/s and deg/s, as plain numbers: arrays of two would cost ten times as much, fifty times a second
         self._velocity = self._velocity_goal = _STILL
+        self._commands: list[tuple[float, tuple[float, float]]] = []  # to drive, that are still under way
         self._bumper = 0
 
     # --- Body --------------------------------------------------------------------------------------------
     def drive(self, x_vel: float, theta_vel: float) -> None:
         """See `Body.drive`."""
         self._basket.stow(self.truth.in_basket())
-        self._velocity_goal = (x_vel, theta_vel)
+        if self._imperfections is None:
+            self._velocity_goal = (x_vel, theta_vel)
+            return
+        if (x_vel, theta_vel) != _STILL:
+            x_vel, theta_vel = self._imperfections.slip(x_vel, theta_vel)
+        self._commands.append((self.data.time + self._imperfections.delay(), (x_vel, theta_vel)))
 
     def move_arm(self, joints: FloatArray, seconds: float) -> None:
         """See `Body.move_arm`."""
@@ -117,10 +133,12 @@ class SimBody:
         """See `Body.state`."""
         qpos = self.data.qpos
         left, right = (angle * _WHEEL_RADIUS for angle in qpos[self._wheel_qpos].tolist())
+        tells = self._imperfections
+        travel_scale, turn_scale = (1.0, 1.0) if tells is None else (tells.travel_scale, tells.turn_scale)
         return BodyState(
             time=self.data.time,
-            travelled=(left + right) / 2,
-            heading=math.degrees((right - left) / _TRACK),
+            travelled=(left + right) / 2 * travel_scale,
+            heading=math.degrees((right - left) / _TRACK) * turn_scale,
             joints=qpos[self._arm_qpos].copy(),
             joint_goal=self.data.ctrl[self._arm_ctrl].copy(),
             gripper=sum(qpos[self._fingers_qpos].tolist()),
@@ -132,6 +150,8 @@ class SimBody:
         if self._renderer is None:
             self._renderer = Renderer(self.model, ROBOT + CAMERA_NAME, self.camera.size)
         rgb, depth = self._renderer.render(self.data)
+        if self._imperfections is not None:
+            rgb, depth = self._imperfections.color(rgb), self._imperfections.depth(depth)
         return rgb, np.where(depth < _MAX_DEPTH, depth * 1000, 0).astype(np.uint16)
 
     def wait(self, seconds: float) -> None:
@@ -154,6 +174,7 @@ class SimBody:
 
     def stop(self) -> None:
         """See `Body.stop`."""
+        self._commands.clear()
         self._velocity = self._velocity_goal = _STILL
         self.data.ctrl[self._wheel_ctrl] = 0.0
         self.move_arm(self.data.qpos[self._arm_qpos].copy(), _CONTROL_S)
@@ -167,6 +188,8 @@ class SimBody:
 
     # --- Servos ------------------------------------------------------------------------------------------
     def _command_wheels(self) -> None:
+        while self._commands and self._commands[0][0] <= self.data.time:
+            self._velocity_goal = self._commands.pop(0)[1]
         if self._velocity == self._velocity_goal:
             return
         forward, turn_rate = map(_approach, self._velocity, self._velocity_goal, _MAX_VELOCITY_CHANGE)

@@ -9,6 +9,7 @@ from lerobot.robots.config import RobotConfig
 
 from relmm.errors import MANY, MAX_SEED, check_range
 from relmm.geometry import camera_geometry
+from relmm.sim.realism import realism
 from relmm.sim.rooms import Room, make_room
 
 
@@ -25,6 +26,7 @@ class LocobotSimConfig(RobotConfig):
         depth: whether observations hold the depth picture too.
         tidy_every: navigation steps of a training after which a person lays what lies stuck at walls and obstacles
             elsewhere; each object counts as an intervention. 0 for never.
+        realism: `none`, or `mild` or `harsh`: noise, light, wheels and delays as of a real robot, drawn anew by seed.
     """
 
     room: str = "no_obstacles"
@@ -33,10 +35,12 @@ class LocobotSimConfig(RobotConfig):
     camera: str = "paper"
     depth: bool = False
     tidy_every: int = 0
+    realism: str = "none"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         camera_geometry(self.camera)
+        realism(self.realism)
         check_range("robot.seed", self.seed or 0, 0, MAX_SEED)
         check_range("robot.tidy_every", self.tidy_every, 0, MANY)
         self.make_room().scatter(np.random.default_rng(0))  # says now if the objects do not fit

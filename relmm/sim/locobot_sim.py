@@ -8,6 +8,7 @@ from relmm.geometry import camera_geometry
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.body import SimBody
 from relmm.sim.config_locobot_sim import LocobotSimConfig
+from relmm.sim.realism import realism
 
 
 class LocobotSim(LocobotRobot):
@@ -22,7 +23,7 @@ class LocobotSim(LocobotRobot):
 
     def make_body(self) -> SimBody:
         """Build the room and put the robot into it."""
-        body = SimBody(self.config.make_room(), camera_geometry(self.config.camera))
+        body = SimBody(self.config.make_room(), camera_geometry(self.config.camera), realism(self.config.realism))
         body.reset(np.random.default_rng(self.config.seed or 0))
         return body
 

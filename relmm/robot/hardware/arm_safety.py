@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 import numpy as np
 
@@ -47,6 +47,30 @@ def check_way(start: FloatArray, goal: FloatArray) -> None:
                 f"On its way from {_degrees(start)} to {_degrees(goal)} degrees the arm would meet {what}: nothing has "
                 "moved."
             )
+
+
+def find_way(start: FloatArray, goal: FloatArray) -> list[FloatArray]:
+    """Poses that lead from one to another past the robot itself: straight, or else one joint after the other.
+
+    Raises:
+        RobotError: there is no such way.
+    """
+    straight: RobotError | None = None
+    for order in ((), *permutations((1, 2, 3))):
+        poses = [start.copy()]
+        for joint in order:
+            poses.append(poses[-1].copy())
+            poses[-1][joint] = goal[joint]
+        poses.append(goal)
+        try:
+            for before, after in pairwise(poses):
+                check_way(before, after)
+        except RobotError as error:
+            straight = straight or error
+        else:
+            return poses[1:]
+    assert straight is not None
+    raise straight
 
 
 def _intrusion(joints: FloatArray) -> tuple[float, str]:

@@ -15,18 +15,20 @@ from relmm.features import FloatArray
 from relmm.geometry import CameraGeometry, arm_forward, arm_inverse
 from relmm.robot.body import BodyState
 from relmm.robot.hardware import clock
+from relmm.robot.hardware.arm_safety import find_way
 from relmm.robot.hardware.calibration import Calibration
 from relmm.robot.hardware.d435 import D435
 from relmm.robot.hardware.kobuki import Kobuki
 from relmm.robot.hardware.kobuki_protocol import BATTERY_CHARGED, BATTERY_EMPTY, BATTERY_LOW, Charger, Sound
 from relmm.robot.hardware.widowx import ArmState, WidowX
+from relmm.robot.skills import REST_POSE
 
 logger = logging.getLogger(__name__)
 
 _SLICE_S = 0.02  # between looks at what may have gone wrong
 _MAX_LATE_S, _LEAST_S = 0.1, 0.001  # that a wait makes up for, and that are worth a sleep
 _PAN, _TILT = 0.0, 0.825  # rad, as the authors had it
-_HEAD_S = 1.2
+_HEAD_S, _RISE_S = 1.2, 1.5
 _POINTS_DOWN = 1.4  # rad, of the gripper's pitch
 _CHARGE_POLL_S = 1.0
 _RECONNECT_S = 60.0  # to wait for a base whose cable is out
@@ -75,6 +77,9 @@ class LocobotBody:
         self.arm.configure()
         self.arm.look(_PAN, _TILT)
         self.wait(_HEAD_S)
+        for pose in find_way(self.arm.state().joints, REST_POSE):  # a limp arm may have been put anywhere
+            self.arm.move(pose, _RISE_S)
+            self.wait(_RISE_S)
 
     @property
     def needs_charging(self) -> bool:

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from dynamixel_emulator import GOAL_PWM, DynamixelEmulator, locobot_motors
 from emulated_time import SharedTime
-from kobuki_emulator import KobukiEmulator
+from kobuki_emulator import TRACK, KobukiEmulator
 
 from relmm.geometry import CAMERAS, CameraGeometry
 from relmm.robot.body import MAX_OPENING
@@ -65,6 +65,7 @@ class EmulatedLocobot:
         self._heading = self.body.truth.robot()[2]
         self._turned = 0.0
         self._gripper_pwm = 0
+        self._lies = self.body.state().joints
         self.person: queue.SimpleQueue[tuple[float, float]] = queue.SimpleQueue()
         self.time = SharedTime(folder / "time")
         motors = locobot_motors()
@@ -118,8 +119,10 @@ class EmulatedLocobot:
 
     # --- What the base moves -----------------------------------------------------------------------------
     def step(self, seconds: float, x_vel: float, theta_vel: float) -> None:
-        self.body._velocity = self.body._velocity_goal  # the driver has limited the acceleration already
-        self.body.drive(x_vel, math.degrees(theta_vel))
+        # Past the simulated body's own limits of acceleration, which are the driver's business here.
+        self.body._velocity = self.body._velocity_goal = (x_vel, math.degrees(theta_vel))
+        turn = theta_vel * TRACK / 2
+        self.body.data.ctrl[self.body._wheel_ctrl] = (x_vel - turn) / WHEEL_RADIUS, (x_vel + turn) / WHEEL_RADIUS
         self._obey()
         self.body.wait(seconds)
         self._publish()
@@ -137,10 +140,11 @@ class EmulatedLocobot:
             now, motors = self.chain.now(), self.chain.motors
             goal = np.array(
                 [
-                    motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else motors[i].angle
-                    for i in ARM_IDS
+                    motors[i].to_angle(motors[i].trajectory(now)) if motors[i].torque else lies
+                    for i, lies in zip(ARM_IDS, self._lies, strict=True)
                 ]
             )
+            self._lies = goal  # a limp arm lies on the robot, and stays there
             for head in (10, 11):
                 motors[head].step(now, PERIOD_S)
             pwm = motors[7].get(GOAL_PWM, signed=True) if motors[7].torque else 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from dynamixel_emulator import (
 
 from relmm.errors import RobotError
 from relmm.geometry import arm_inverse
+from relmm.robot.hardware.arm_safety import check_way, find_way
 from relmm.robot.hardware.gripper import GripperControl, angle_of, opening_of
 from relmm.robot.hardware.motors import JOINTS, LocobotMotorsBus
 from relmm.robot.hardware.widowx import SLEEP_POSE, WidowX
@@ -128,6 +130,16 @@ def test_forbidden_ways_are_refused_before_anything_moves(chain, arm, goal, word
     with pytest.raises(RobotError, match=words):
         arm.move(goal, 1.0)
     assert chain.log == []
+
+
+def test_way_round_the_robot_is_found():
+    fallen = np.radians([0.0, -107.0, 93.0, 83.0, 0.0])  # onto the base, gripper first
+    with pytest.raises(RobotError, match="the robot itself"):
+        check_way(fallen, REST_POSE)
+    way = [fallen, *find_way(fallen, REST_POSE)]
+    assert np.array_equal(way[-1], REST_POSE)
+    for start, goal in pairwise(way):
+        check_way(start, goal)
 
 
 def test_sag_lifts_the_goal(chain, tmp_path):
