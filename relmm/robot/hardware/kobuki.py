@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import dataclass, replace
 
 from relmm.errors import RobotError
@@ -107,9 +108,9 @@ class Kobuki:
         Raises:
             RobotError: none has come.
         """
-        until = clock.now() + _START_S
+        until = time.monotonic() + _START_S  # our time: it is the guard's process that takes so long to start
         while self.state().packets == 0:
-            if clock.now() > until:
+            if time.monotonic() > until:
                 raise RobotError(
                     f"The base does not answer on {self.port}: switch it on, plug it in, or say another "
                     "--robot.base_port (relmm-doctor --robot.type=locobot looks for it)."
