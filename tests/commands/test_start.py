@@ -17,6 +17,7 @@ FUNCTIONS = {
     "relmm-eval": "evaluate",
     "relmm-record": "record",
     "relmm-analyze": "analyze",
+    "relmm-calibrate": "calibrate",
     "relmm-upload": "upload",
 }
 CONFIGS = {TrainConfig: "relmm-train", EvalConfig: "relmm-eval", RecordConfig: "relmm-record"}
@@ -25,6 +26,7 @@ KINDS = {
     "relmm-eval": ("--policy.type=relmm", "--env.type=relmm_room"),
     "relmm-record": ("--policy.type=relmm", "--robot.type=locobot_sim"),
     "relmm-analyze": ("--policy.type=relmm",),
+    "relmm-calibrate": ("--robot.type=locobot",),
     "relmm-upload": (),
 }
 
