@@ -126,7 +126,7 @@ class Motor:
 
     def trajectory(self, now: float) -> float:
         start, goal, began, seconds, ramp = self.profile
-        passed = now - began
+        passed = max(now - began, 0.0)  # another thread may have begun it a moment later
         if passed >= seconds:
             return goal
         top = (goal - start) / (seconds - ramp)  # speed between the ramps

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("serial", reason="pyserial is not installed (the extra `hardware`)")
 pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
+pytestmark = pytest.mark.slow  # real protocols in real time, which a busy machine upsets
 
 from dynamixel_sdk import port_handler
 from emulated_time import SharedTime

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("serial", reason="pyserial is not installed (the extra `hardware`)")
 pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
+pytestmark = pytest.mark.slow  # real protocols in real time, which a busy machine upsets
 
 from dynamixel_emulator import BAUD_RATE, MODEL, TEMPERATURE, VOLTAGE, DynamixelEmulator
 from kobuki_emulator import KobukiEmulator

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
+pytestmark = pytest.mark.slow  # real protocols in real time, which a busy machine upsets
 
 from dynamixel_emulator import (
     DRIVE_MODE,
