@@ -35,6 +35,7 @@ ELBOW_OFFSET = (0.05, 0.2)  # m, forward and up from the shoulder
 FOREARM = 0.2  # m
 WRIST_LENGTH = 0.065  # m, from the wrist joint to the rotating part
 TOOL_LENGTH = 0.158575  # m, from the wrist joint to the point between the finger pads
+FINGERTIP = 0.012  # m beyond that point
 UPPER_ARM = float(np.hypot(*ELBOW_OFFSET))
 ELBOW_ANGLE = float(np.arctan2(*ELBOW_OFFSET))  # rad, of the upper arm's line against the vertical
 # rad: waist, shoulder, elbow, wrist angle, wrist rotation (servo limits of `locobot_wx200.yaml`, rounded inwards)
@@ -94,6 +95,9 @@ def arm_forward(joints: FloatArray) -> FloatArray:
 
 
 # --- Camera --------------------------------------------------------------------------------------------------
+OBJECT_HEIGHT = 0.012  # m; objects are looked at half-way up, or a far one would seem to lie behind its place
+
+
 @dataclass(frozen=True)
 class CameraGeometry:
     """A pinhole camera fixed to the robot, looking forward and down.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relmm.features import GRASP_X, GRASP_Y, IMAGE_SIZE, FloatArray
-from relmm.geometry import CameraGeometry
+from relmm.geometry import OBJECT_HEIGHT, CameraGeometry
 
 _MARGIN = 0.04  # m of floor round the grasp area
 _SPOT = 4  # pixels either side of where the gripper goes
@@ -55,7 +55,7 @@ class Viewer:
     def _colour(self, image: NDArray[np.uint8], x: float, y: float) -> str:
         if self._camera is None:
             return ""
-        pixel = self._camera.project(np.array([x, y, 0.012]))
+        pixel = self._camera.project(np.array([x, y, OBJECT_HEIGHT]))
         if not (np.isfinite(pixel).all() and (pixel >= 0).all() and (pixel < IMAGE_SIZE).all()):
             return ""
         column, row = pixel.round().astype(int)

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 
 from relmm.analysis.performance import share
+from relmm.analysis.reading import FOLLOWS_S
 from relmm.analysis.statistics import unlikely_failures
 from relmm.features import GRID, NAVIGATION_STEP_S
 
-_GAP_S = 60.0
 _SELDOM = 0.001  # of a stretch without success that chance does not explain
 _LISTED = 20  # of a kind of finding
 
@@ -166,7 +166,7 @@ def _gaps(frames: pd.DataFrame) -> dict[str, Any] | None:
     later = frames.shift(-1)
     same = (later["run"] == frames["run"]) & (later["episode"] == frames["episode"])
     wait = later["robot_time"] - frames["robot_time"]
-    gaps = frames[(same & ((wait > _GAP_S) | (wait < 0))) | (later["index"] > frames["index"] + 1)]
+    gaps = frames[(same & ((wait > FOLLOWS_S) | (wait < 0))) | (later["index"] > frames["index"] + 1)]
     if not len(gaps):
         return None
     words = f"the recording has {len(gaps)} gaps: frames that are missing, or a clock that jumps within an episode"

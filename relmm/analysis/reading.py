@@ -6,22 +6,24 @@ read is left out, and said.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from relmm.analysis.columns import belief, column, fingerprints, matrix, without_nulls
 from relmm.episodes.folder import EPISODE_FILES, INFO, RELMM, DatasetFolder
 from relmm.episodes.info import runs_of
 from relmm.episodes.outcomes import DERIVED, with_outcomes
 from relmm.episodes.parquet import are_whole_numbers
 from relmm.episodes.settings import LEROBOT_COLUMNS, check_trainable
-from relmm.episodes.survey import read_columns, read_places
+from relmm.episodes.survey import read_columns, read_places, rows_of
+from relmm.episodes.video import VIDEO_COLUMNS, in_video, read_video
 from relmm.features import (
     ACTION_NAMES,
     BELIEF,
@@ -41,7 +43,7 @@ from relmm.geometry import CAMERAS
 
 _OPTIONAL = tuple(f"complementary_info.{name}" for name in (*BELIEF, *ODOMETRY))
 _STATE = {name: STATE_NAMES.index(name) for name in ("holding.pos", "gripper.pos")}
-_FOLLOWS_S = 60.0  # a frame that begins later than this after the one before does not follow on it
+FOLLOWS_S = 60.0  # a frame that begins later than this after the one before does not follow on it
 _FOLLOWS_M = 0.5  # nor one that is farther away; a skill moves the base by 0.1 m
 
 
@@ -73,7 +75,7 @@ class Reader:
         self.root = root
         self._folder = DatasetFolder(root)
         info = self._folder.read_json(INFO) or {}
-        self._features, self._data_path = info["features"], str(info["data_path"])
+        self._features, self._data_path, self._fps = info["features"], str(info["data_path"]), float(info["fps"])
         self.columns = [name for name in dict.fromkeys((*DERIVED, *_OPTIONAL)) if name in self._features]
         self.runs = runs_of(self._folder.read_json(RELMM))
         self.camera_name = _camera_name(self._features)
@@ -103,7 +105,7 @@ class Reader:
         """Rows of meta/episodes, as far as its files can be read."""
         rows: list[dict[str, Any]] = []
         for name in self._folder.files(EPISODE_FILES):
-            table = read_places(self._folder.root / name)
+            table = read_places(self._folder.root / name, VIDEO_COLUMNS if in_video(self._features) else ())
             if table is None:
                 self._lose(name, "missing or cut off")
             else:
@@ -121,10 +123,13 @@ class Reader:
         return DEPTH_KEY in self._features
 
     def episodes(self, columns: list[str]) -> Iterator[tuple[dict[str, Any], pa.Table]]:
-        """Rows of meta/episodes, each with these columns of its frames; what is damaged is left out and noted."""
+        """Rows of meta/episodes, each with these columns of its frames, picture too; damage is left out and noted."""
         rows, name, table = self.rows(), "", None
         self.frames_listed = sum(max(row["length"], 0) for row in rows)
         wanted = ["episode_index", "index", *columns]
+        filmed = in_video(self._features)
+        if filmed:
+            wanted.remove(IMAGE_KEY)
         for number in range(len(rows)):
             if not (self.root / self._place(rows[number])).is_file():
                 # A recorder that ends packs its small files into a few: then everything is listed anew.
@@ -133,11 +138,25 @@ class Reader:
             if self._place(row) != name:
                 name = self._place(row)
                 table = self._file(name, wanted)
-            part = None if table is None else _slice(table, row)
+            part = None if table is None else rows_of(row, table)
             if part is None and table is not None:
                 self._lose(name, "without all the frames that are listed")
+            if part is not None and filmed:
+                part = self._with_pictures(row, part)
             if part is not None:
                 yield row, part
+
+    def _with_pictures(self, row: dict[str, Any], part: pa.Table) -> pa.Table | None:
+        """The rows of an episode with the pictures of its video, as they would be stored without one."""
+        try:
+            images = read_video(self.root, row, len(part), self._fps)
+        except ValueError:
+            images = None
+        if images is None:
+            self._lose(f"the video of episode {row['episode_index']}", "missing or damaged")
+            return None
+        files = [cv2.imencode(".png", image[..., ::-1])[1].tobytes() for image in images]
+        return part.append_column(IMAGE_KEY, pa.array([{"bytes": file} for file in files]))
 
     def _place(self, row: dict[str, Any]) -> str:
         return self._data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
@@ -166,8 +185,8 @@ class Reader:
 
     def _numbers(self, row: dict[str, Any], table: pa.Table) -> tuple[Columns, int]:
         """The numbers of an episode, and how many frames had none."""
-        filled, known = with_outcomes(_without_nulls(table), DERIVED)
-        states, actions = _matrix(filled, STATE_KEY, len(STATE_NAMES)), _matrix(filled, "action", len(ACTION_NAMES))
+        filled, known = with_outcomes(without_nulls(table), DERIVED)
+        states, actions = matrix(filled, STATE_KEY, len(STATE_NAMES)), matrix(filled, "action", len(ACTION_NAMES))
         columns: Columns = {
             "episode": np.full(len(filled), row["episode_index"]),
             "frame": np.arange(len(filled)),
@@ -178,15 +197,15 @@ class Reader:
             "skill_x": actions[:, 3],
             "skill_y": actions[:, 4],
             **{name.partition(".")[0]: states[:, i] for name, i in _STATE.items()},
-            "success": _column(filled, "next.reward") > 0.5,
-            "phase": _column(filled, "complementary_info.phase"),
-            "robot_time": _column(filled, "complementary_info.robot_time"),
-            **{name: _belief(filled, name) for name in (*BELIEF, *ODOMETRY)},
+            "success": column(filled, "next.reward") > 0.5,
+            "phase": column(filled, "complementary_info.phase"),
+            "robot_time": column(filled, "complementary_info.robot_time"),
+            **{name: belief(filled, name) for name in (*BELIEF, *ODOMETRY)},
             "known": known,
-            "fingerprint": _fingerprints(table, states, actions),
+            "fingerprint": fingerprints(table, states, actions),
         }
         needed = ["skill", "skill_x", "skill_y", "phase", "robot_time", "x_vel", "theta_vel", "holding"]
-        numbers = np.stack([*(columns[name] for name in needed), _column(filled, "next.reward")])
+        numbers = np.stack([*(columns[name] for name in needed), column(filled, "next.reward")])
         usable = np.isfinite(numbers).all(axis=0)
         usable &= np.isin(columns["skill"], list(Skill)) & np.isin(columns["phase"], list(Phase))
         return {name: values[usable] for name, values in columns.items()}, int((~usable).sum())
@@ -210,7 +229,7 @@ def with_consequences(frames: pd.DataFrame, runs: list[dict[str, Any]]) -> pd.Da
     seconds = later["robot_time"] - frames["robot_time"]
     near = np.hypot(later["odom_x"] - frames["odom_x"], later["odom_y"] - frames["odom_y"]) < _FOLLOWS_M
     near |= frames["odom_x"].isna() & (later["episode"] == frames["episode"])
-    frames["follows"] = (later["index"] == frames["index"] + 1) & (seconds > 0) & (seconds < _FOLLOWS_S) & near
+    frames["follows"] = (later["index"] == frames["index"] + 1) & (seconds > 0) & (seconds < FOLLOWS_S) & near
     frames["follows"] &= later["run"] == frames["run"]
     frames["seconds"] = seconds.where(frames["follows"])
     for name in ("holding", "gripper"):
@@ -226,67 +245,6 @@ def cells_of(x: FloatArray, y: FloatArray) -> NDArray[np.int64]:
     iy = np.floor((y - GRASP_Y[0]) / (GRASP_Y[1] - GRASP_Y[0]) * GRID)
     inside = (ix >= 0) & (ix < GRID) & (iy >= 0) & (iy < GRID)
     return np.where(inside, GRID * ix + iy, -1).astype(np.int64)
-
-
-def _slice(table: pa.Table, row: dict[str, Any]) -> pa.Table | None:
-    """The rows of an episode; None where they are not all there."""
-    length, start = row["dataset_to_index"] - row["dataset_from_index"], row["dataset_from_index"]
-    if not 0 < length <= len(table):
-        return None
-    begin = int(np.searchsorted(table["index"].to_numpy(), start))
-    part = table.slice(begin, length)
-    whole = np.array_equal(part["index"].to_numpy(), np.arange(start, start + length))
-    return part if whole and np.all(part["episode_index"].to_numpy() == row["episode_index"]) else None
-
-
-def _without_nulls(table: pa.Table) -> pa.Table:
-    """Pictures aside, with NaN for what is missing."""
-    for name in [name for name in table.column_names if table[name].null_count and name != IMAGE_KEY]:
-        values = pa.array(table[name].to_pandas().astype(float)) if not _is_list(table[name].type) else None
-        if values is not None:
-            table = table.set_column(table.column_names.index(name), name, values)
-    return table.drop_columns([IMAGE_KEY])
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
-
-
-def _matrix(table: pa.Table, name: str, width: int) -> FloatArray:
-    """A column of lists, (n, width); NaN for rows of another length."""
-    values = table[name].combine_chunks()
-    flat = values.flatten().to_numpy(zero_copy_only=False)
-    if len(flat) == width * len(table):
-        return flat.astype(np.float64).reshape(-1, width)
-    rows = [row if row is not None and len(row) == width else [np.nan] * width for row in values.to_pylist()]
-    return np.array(rows, float)
-
-
-def _column(table: pa.Table, name: str) -> FloatArray:
-    values = table[name].combine_chunks()
-    if _is_list(values.type):  # LeRobot stores (1,) as a number, other tools as a list
-        values = values.flatten()
-    numbers: FloatArray = values.to_numpy(zero_copy_only=False).astype(np.float64)
-    return numbers
-
-
-def _belief(table: pa.Table, name: str) -> FloatArray:
-    """A column of `BELIEF` or `ODOMETRY`; NaN where it is missing, or the policy had no opinion."""
-    key = f"complementary_info.{name}"
-    if key not in table.column_names:
-        return np.full(len(table), np.nan)
-    values = _column(table, key)
-    return np.where(values < 0, np.nan, values) if name in BELIEF else values
-
-
-def _fingerprints(table: pa.Table, states: FloatArray, actions: FloatArray) -> NDArray[np.uint64]:
-    """Of picture, state and action: two frames with the same one are copies."""
-    pictures = table[IMAGE_KEY].combine_chunks().field("bytes").to_pylist()
-    digests = (
-        hashlib.blake2b((picture or b"") + state.tobytes() + action.tobytes(), digest_size=8).digest()
-        for picture, state, action in zip(pictures, states, actions, strict=True)
-    )
-    return np.array([int.from_bytes(digest) for digest in digests], np.uint64)
 
 
 def _camera_name(features: dict[str, Any]) -> str | None:

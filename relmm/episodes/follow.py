@@ -22,7 +22,7 @@ from relmm.episodes.outcomes import with_outcomes
 from relmm.episodes.parquet import are_whole_numbers
 from relmm.episodes.pictures import decode_picture
 from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
-from relmm.episodes.survey import PLACE_COLUMNS, read_columns, read_places
+from relmm.episodes.survey import read_columns, read_places, rows_of
 from relmm.episodes.video import VIDEO_COLUMNS, in_video, read_video
 from relmm.errors import DatasetError
 from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
@@ -183,9 +183,8 @@ class EpisodeFollower:
 
     def _rows(self, name: str) -> list[dict[str, Any]] | None:
         inode = self._inode(name)  # before it is read: what comes in between is seen as another one the next time
-        table = read_places(self._folder.root / name)
-        if table is not None and self._data is not None and self._data.in_video:
-            table = read_columns(self._folder.root / name, [*PLACE_COLUMNS, *VIDEO_COLUMNS])
+        in_videos = self._data is not None and self._data.in_video
+        table = read_places(self._folder.root / name, VIDEO_COLUMNS if in_videos else ())
         if table is None:
             return None
         rows: list[dict[str, Any]] = table.to_pylist()
@@ -220,18 +219,8 @@ class _DataFiles:
             self._table = read_columns(self._folder.root / name, self._layout.columns)
             if self._table is not None and not are_whole_numbers(self._table, ["episode_index", "index"]):
                 self._table = None
-        length = row["dataset_to_index"] - row["dataset_from_index"]
-        if self._table is None or not 0 < length <= len(self._table):
-            return None
-        expected = np.arange(row["dataset_from_index"], row["dataset_to_index"])
-        begin = int(np.searchsorted(self._table["index"].to_numpy(), row["dataset_from_index"]))
-        frames = self._table.slice(begin, len(expected))
-        whole = (
-            length == row["length"]
-            and np.array_equal(frames["index"].to_numpy(), expected)
-            and np.all(frames["episode_index"].to_numpy() == row["episode_index"])
-        )
-        return self._episode(row, frames) if whole else None
+        frames = None if self._table is None else rows_of(row, self._table)
+        return None if frames is None else self._episode(row, frames)
 
     def _episode(self, row: dict[str, Any], frames: pa.Table) -> Episode | None:
         index, where = row["episode_index"], self._folder.root / self._name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,13 +65,28 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table | None:
     return table if len(table.column_names) == len(columns) else None
 
 
-def read_places(path: Path) -> pa.Table | None:
-    """`PLACE_COLUMNS` of a file of meta/episodes; None also where they are not whole numbers."""
-    table = read_columns(path, PLACE_COLUMNS)
+def read_places(path: Path, more: Sequence[str] = ()) -> pa.Table | None:
+    """`PLACE_COLUMNS`, and more, of a file of meta/episodes; None also where the first are not whole numbers."""
+    table = read_columns(path, [*PLACE_COLUMNS, *more])
     if table is None or not are_whole_numbers(table, PLACE_COLUMNS[:-1]):
         return None
     tasks = table["tasks"]
     return table if pa.types.is_list(tasks.type) and tasks.null_count == 0 else None
+
+
+def rows_of(episode: dict[str, Any], table: pa.Table) -> pa.Table | None:
+    """The rows of an episode in a data file; None where they are not all there.
+
+    Args:
+        episode: a row of meta/episodes, with `PLACE_COLUMNS`.
+        table: with `episode_index` and `index`.
+    """
+    start, length = episode["dataset_from_index"], episode["dataset_to_index"] - episode["dataset_from_index"]
+    if not 0 < length <= len(table) or length != episode["length"]:
+        return None
+    part = table.slice(int(np.searchsorted(table["index"].to_numpy(), start)), length)
+    whole = np.array_equal(part["index"].to_numpy(), np.arange(start, start + length))
+    return part if whole and np.all(part["episode_index"].to_numpy() == episode["episode_index"]) else None
 
 
 def survey(folder: DatasetFolder, data_path: str) -> Survey:

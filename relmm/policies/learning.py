@@ -96,17 +96,19 @@ class Learner(ABC):
         rng: of the batches.
         noise: the same, for torch.
         logs: of the last updates, for the metrics.
+        attempts_since_first_success: attempts from the first that succeeded on, 0 if none has.
     """
 
     optimizers: dict[str, torch.optim.Optimizer]
     rng: np.random.Generator
     noise: torch.Generator
     logs: dict[str, float]
+    attempts_since_first_success: int = 0
 
-    @property
-    @abstractmethod
-    def attempts_since_first_success(self) -> int:
-        """How many attempts there were from the first that succeeded on, 0 if none has."""
+    def count_attempt(self, success: bool) -> None:
+        """Count an attempt; `add` calls this for each."""
+        if success or self.attempts_since_first_success:
+            self.attempts_since_first_success += 1
 
     @abstractmethod
     def add(

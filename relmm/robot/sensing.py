@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relmm.features import SCAN_BEARINGS, SCAN_RANGE, FloatArray
-from relmm.geometry import ARM_BASE, TOOL_LENGTH, CameraGeometry, arm_forward
+from relmm.geometry import ARM_BASE, FINGERTIP, TOOL_LENGTH, CameraGeometry, arm_forward
 from relmm.robot.body import BodyState
 
 Depth = NDArray[np.unsignedinteger[Any]]
@@ -30,7 +30,6 @@ _SCAN_POINTS = 3  # the same in one sector of a scan
 _SECTOR = SCAN_BEARINGS[1] - SCAN_BEARINGS[0]  # degrees
 _ARM_REACH = 0.65  # m from the robot's centre; no part of the arm gets farther
 _ARM_HALF_WIDTH, _ARM_HALF_THICKNESS = 0.045, 0.025  # m, of the open gripper, with 7 mm to spare
-_FINGERTIP = 0.012  # m beyond the point between the pads
 
 # --- Stopping on contact -------------------------------------------------------------------------------------
 # Over 46,000 looks at normal grasps and placements in the four rooms: 0.032 rad, 0.4 mm and 0.4 degrees at most.
@@ -143,7 +142,7 @@ def _points_in_arm(points: FloatArray, joints: FloatArray) -> int:
     beside = np.abs(offset @ (-forward[1], forward[0])) < _ARM_HALF_WIDTH
     plane = np.column_stack([offset @ forward, points[:, 2]])[beside]
     corners = arm_forward(joints)
-    corners = np.vstack([corners, corners[3] + (corners[3] - corners[2]) * _FINGERTIP / TOOL_LENGTH])
+    corners = np.vstack([corners, corners[3] + (corners[3] - corners[2]) * FINGERTIP / TOOL_LENGTH])
     links = np.column_stack([(corners[:, :2] - ARM_BASE[:2]) @ forward, corners[:, 2]])
     distances = [_distance(plane, start, end) for start, end in pairwise(links)]
     return int(np.count_nonzero(np.min(distances, axis=0) < _ARM_HALF_THICKNESS))

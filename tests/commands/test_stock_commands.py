@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from relmm.analysis import collect
 from relmm.episodes import read_episodes, summarize
 from relmm.features import ACTION_NAMES, STATE_NAMES, Skill
 
@@ -62,6 +63,10 @@ def test_what_lerobot_record_has_recorded_can_be_learned_from(run, tmp_path):
     )  # what the controller does when it holds something
     assert episode.rewards[: len(placed)].sum() == placed.sum() > 0
     assert summarize(tmp_path / "room").successful_grasps == placed.sum()
+    analysed = collect(tmp_path / "room", tmp_path / "report")
+    assert analysed.notes == []
+    assert analysed.grasps["success"].sum() == placed.sum()
+    assert analysed.grasps["light"].between(0.05, 1).all(), "each has its picture"
     result = run(
         "relmm-train",
         "--robot.type=locobot_sim",

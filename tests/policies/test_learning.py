@@ -120,6 +120,14 @@ def test_the_fingerprint_tells_the_networks_of_one_config_from_those_of_another(
 
 # --- Learners ------------------------------------------------------------------------------------------------
 @kinds
+@pytest.mark.parametrize(("life", "count"), [("dff", 0), ("fsf", 2), ("sffs", 4), ("", 0)])
+def test_attempts_are_counted_from_the_first_success_on(life: str, count: int, kind: str, make_policy: Any) -> None:
+    learner = make_policy(kind, seed=1).make_learner(seed=2, capacity=100)
+    live(learner, frames(life, 0))
+    assert learner.attempts_since_first_success == count
+
+
+@kinds
 def test_reading_a_recorded_life_teaches_what_living_it_did(kind: str, make_policy: Any) -> None:
     lived, read, unlearned = (make_policy(kind, seed=1) for _ in range(3))
     learners = [policy.make_learner(seed=2, capacity=100) for policy in (lived, read, unlearned)]
@@ -149,8 +157,6 @@ def test_reading_a_recorded_life_teaches_what_living_it_did(kind: str, make_poli
 
 class Notes(Learner):
     """A learner that notes what it is asked."""
-
-    attempts_since_first_success = 0
 
     def __init__(self) -> None:
         self.notes: list[Any] = []

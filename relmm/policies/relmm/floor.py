@@ -12,10 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from relmm.features import GRASP_X, GRASP_Y, GRID
-from relmm.geometry import CameraGeometry
-
-# Objects are looked at half-way up, or a far one would seem to lie behind its place.
-OBJECT_HEIGHT = 0.012  # m
+from relmm.geometry import OBJECT_HEIGHT, CameraGeometry
 
 
 class FloorView(nn.Module):

@@ -84,12 +84,6 @@ class ReLMMLearner(Learner):
         self.noise = torch.Generator().manual_seed(seed)
         self.optimizers = {"grasping": torch.optim.Adam(grasping.learned(), lr=self._config.learning_rate, fused=True)}
         self.logs = {}
-        self._first_success: int | None = None
-
-    @property
-    def attempts_since_first_success(self) -> int:
-        """See `Learner`."""
-        return 0 if self._first_success is None else self.attempts.added - self._first_success
 
     def add(
         self,
@@ -101,8 +95,7 @@ class ReLMMLearner(Learner):
     ) -> None:
         """See `Learner`: only attempts teach anything."""
         if round(float(action[_SKILL])) == Skill.GRASP:
-            if success and self._first_success is None:
-                self._first_success = self.attempts.added
+            self.count_attempt(success)
             self.attempts.add(self._grasping.area(self._grasping.to_pictures(picture))[0], action, success)
 
     def save_episode(self) -> None:

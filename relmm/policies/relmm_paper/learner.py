@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from relmm.features import Phase
+from relmm.features import ACTION_NAMES, Phase, Skill
 from relmm.policies.learning import Learner
 from relmm.policies.relmm_paper.navigation import ACTIONS, NavigationBatch, from_navigation_steps
 from relmm.policies.relmm_paper.perturbation import Perturbation
@@ -21,6 +21,8 @@ MIN_PERTURBATION_STEPS = 300  # before the first update, as in the authors' code
 
 if TYPE_CHECKING:
     from relmm.policies.relmm_paper.modeling_relmm_paper import RelmmPaperPolicy
+
+_SKILL = ACTION_NAMES.index("skill.pos")
 
 
 class RelmmPaperLearner(Learner):
@@ -53,11 +55,6 @@ class RelmmPaperLearner(Learner):
         self.logs = {}
 
     # --- Filling ------------------------------------------------------------------------------------------
-    @property
-    def attempts_since_first_success(self) -> int:
-        """See `Learner.attempts_since_first_success`."""
-        return self.replay.attempts_since_first_success
-
     def add(
         self,
         picture: NDArray[np.uint8],
@@ -67,6 +64,8 @@ class RelmmPaperLearner(Learner):
         phase: int,
     ) -> None:
         """See `Learner.add`; the paper's policy has no use for the state."""
+        if round(float(action[_SKILL])) == Skill.GRASP:
+            self.count_attempt(success)
         self.replay.add(picture, action, success, phase)
         if self.policy.perturbations:
             self.perturbations.add(picture, action, phase)

@@ -166,12 +166,6 @@ class Replay:
         self._first_attempt = None
 
     # --- Reading ------------------------------------------------------------------------------------------
-    @property
-    def attempts_since_first_success(self) -> int:
-        """How many attempts there were from the first that succeeded on, 0 if none has."""
-        successes = self.attempts["success"]
-        return len(successes) - int(successes.argmax()) if successes.any() else 0
-
     def sample_attempts(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """The newest rows, uniformly, with replacement, (count,); there must be one."""
         return rng.integers(max(len(self.attempts) - self.capacity, 0), len(self.attempts), count)

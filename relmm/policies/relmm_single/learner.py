@@ -39,12 +39,6 @@ class RelmmSingleLearner(Learner):
         weights = policy.get_optim_params()
         self.optimizers = {"policy": torch.optim.Adam(weights, lr=self.config.learning_rate, fused=True)}
         self.logs = {}
-        self._attempts = self._attempts_before_success = 0
-
-    @property
-    def attempts_since_first_success(self) -> int:
-        """See `Learner.attempts_since_first_success`."""
-        return self._attempts - self._attempts_before_success
 
     def add(
         self,
@@ -58,9 +52,7 @@ class RelmmSingleLearner(Learner):
         skill = round(float(action[COLUMNS.index("skill")]))
         self.steps.end(picture)
         if skill == Skill.GRASP:
-            first = not success and self._attempts == self._attempts_before_success
-            self._attempts += 1
-            self._attempts_before_success += first
+            self.count_attempt(success)
         if phase != Phase.PSEUDO_RESET and skill != Skill.PLACE:
             self.steps.begin(picture, **dict(zip(COLUMNS, map(float, action), strict=True)))
             if success:

@@ -8,11 +8,10 @@ import numpy as np
 
 from relmm.errors import RobotError
 from relmm.features import FloatArray
-from relmm.geometry import JOINT_LIMITS, TOOL_LENGTH, arm_forward
+from relmm.geometry import FINGERTIP, JOINT_LIMITS, TOOL_LENGTH, arm_forward
 
 _STEPS = 20  # poses of a way that are looked at
 _POINTS = 6  # of each link
-_FINGERTIP = 0.012  # m beyond the point between the pads
 _FLOOR = 0.0  # m; the fingers come as near as 2 mm to it when they grasp
 # Parts of the robot that the arm could meet, as upright cylinders with a margin for its own thickness, as in the
 # simulation's `locobot.xml`: (x, y), radius, and heights, m. The arm folds between the tower's posts.
@@ -88,7 +87,7 @@ def _intrusion(joints: FloatArray) -> tuple[float, str]:
 def _points(joints: FloatArray) -> FloatArray:
     """Points of the links beyond the shoulder, m, robot frame, (n, 3)."""
     corners = arm_forward(joints)
-    tip = corners[3] + (corners[3] - corners[2]) * _FINGERTIP / TOOL_LENGTH
+    tip = corners[3] + (corners[3] - corners[2]) * FINGERTIP / TOOL_LENGTH
     corners = np.vstack([corners[1:], tip])
     return np.vstack([np.linspace(start, end, _POINTS) for start, end in pairwise(corners)])
 

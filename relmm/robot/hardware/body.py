@@ -17,7 +17,7 @@ from relmm.robot.body import BodyState
 from relmm.robot.hardware import clock
 from relmm.robot.hardware.arm_safety import find_way
 from relmm.robot.hardware.calibration import Calibration
-from relmm.robot.hardware.d435 import D435
+from relmm.robot.hardware.d435 import D435, NO_PICTURES
 from relmm.robot.hardware.kobuki import Kobuki
 from relmm.robot.hardware.kobuki_protocol import BATTERY_CHARGED, BATTERY_EMPTY, BATTERY_LOW, Charger, Sound
 from relmm.robot.hardware.widowx import ArmState, WidowX
@@ -196,7 +196,7 @@ class LocobotBody:
         if not self.base.alive:
             self._wait_for_base()
         if not self.eye.alive:
-            raise RobotError("The camera sends no pictures: check its cable, and that it is plugged into USB 3.")
+            raise RobotError(NO_PICTURES)
         if (battery := self.base.state().battery) < BATTERY_EMPTY:
             raise RobotError(f"The battery is at {battery:.1f} V, nearly empty: charge the robot, and start again.")
         self.arm.check_health()

@@ -18,6 +18,7 @@ WIDTH, HEIGHT, FPS = 640, 480, 30
 _SUPERSAMPLING = 4  # a picture of 100x100 is averaged from one four times as large
 _NO_MAP = np.empty(0, np.float32)  # the other map holds columns and rows
 _POLL_S, _LOST_S = 0.005, 2.0
+NO_PICTURES = "The camera sends no pictures: check its cable, and that it is plugged into USB 3."
 
 
 class AlignedRealSense(RealSenseCamera):
@@ -60,13 +61,13 @@ class D435:
     picture is black, and has no depth.
 
     Args:
-        serial_number: of the camera, or its name; None for the only one.
+        serial_number: of the camera, or its name; auto for the only one.
         view: how the pictures are to look.
         pitch: degrees that it really looks down.
         latency: s between what happens and the picture that shows it.
     """
 
-    def __init__(self, serial_number: str | None, view: CameraGeometry, pitch: float, latency: float) -> None:
+    def __init__(self, serial_number: str, view: CameraGeometry, pitch: float, latency: float) -> None:
         self._latency = latency
         self._camera = open_camera(serial_number)
         self._unit = self._camera.depth_unit()
@@ -94,7 +95,7 @@ class D435:
             if taken >= earliest and color is not None and depth is not None:
                 return color, depth
             if time.perf_counter() > earliest + _LOST_S:
-                raise RobotError("The camera sends no pictures: check its cable, and that it is plugged into USB 3.")
+                raise RobotError(NO_PICTURES)
             time.sleep(_POLL_S)
 
     @property
@@ -149,14 +150,14 @@ def view_maps(view: CameraGeometry, pitch: float, intrinsics: FloatArray) -> Vie
     return ViewMaps(fine, coarse, 1.0 / forward)
 
 
-def open_camera(serial_number: str | None) -> AlignedRealSense:
-    """LeRobot's camera, connected; None for the only one.
+def open_camera(serial_number: str) -> AlignedRealSense:
+    """LeRobot's camera, connected; auto for the only one.
 
     Raises:
         RobotError: it cannot be; says what to do.
     """
     try:
-        number = serial_number or _only_camera()
+        number = _only_camera() if serial_number == "auto" else serial_number
         config = RealSenseCameraConfig(number, fps=FPS, width=WIDTH, height=HEIGHT, use_depth=True)
         camera = AlignedRealSense(config)
         camera.connect()

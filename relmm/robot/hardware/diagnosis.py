@@ -12,7 +12,7 @@ from relmm.robot.hardware.kobuki import Kobuki
 from relmm.robot.hardware.kobuki_protocol import BATTERY_LOW, Charger
 from relmm.robot.hardware.motors import BAUD_RATE, FACTORY_BAUD_RATE, JOINTS, LocobotMotorsBus
 from relmm.robot.hardware.ports import find_port
-from relmm.robot.hardware.widowx import ERRORS, MAX_TEMPERATURE
+from relmm.robot.hardware.widowx import MAX_TEMPERATURE, NO_SDK, error_words
 
 _VOLTAGE = (9.5, 14.8)  # V at which the motors work
 _SILENT = (ConnectionError, OSError, RuntimeError, termios.error, IndexError)
@@ -65,7 +65,7 @@ class _Motors:
             bus.connect(handshake=False)
             bus.set_baudrate(BAUD_RATE)
         except ImportError as error:
-            raise RobotError("The arm needs dynamixel-sdk: pip install 'lerobot_policy_relmm[hardware]'.") from error
+            raise RobotError(NO_SDK) from error
         except _SILENT as error:
             raise RobotError(
                 f"{port} cannot be opened: plug the arm's adapter in, close other programs that use it, and see that "
@@ -118,10 +118,9 @@ class _Motors:
             read("Hardware_Error_Status"),
         )
         if error:
-            what = ", ".join(text for bit, text in ERRORS.items() if error & bit) or f"error {error}"
             raise RobotError(
-                f"Motor {JOINTS[name].id} has switched itself off ({what}): free what is stuck, and switch the robot "
-                "off and on."
+                f"Motor {JOINTS[name].id} has switched itself off ({error_words(error)}): free what is stuck, and "
+                "switch the robot off and on."
             )
         if not _VOLTAGE[0] <= volts <= _VOLTAGE[1]:
             raise RobotError(f"Motor {JOINTS[name].id} gets {volts:.1f} V, and 12 V are right: check the arm's power.")
@@ -137,7 +136,7 @@ class _Motors:
 
 def check_camera(config: LocobotConfig) -> str:
     """Whether it is there, at the speed of USB 3, and sends pictures."""
-    camera = open_camera(None if config.camera_serial == "auto" else config.camera_serial)
+    camera = open_camera(config.camera_serial)
     try:
         number, lens = camera.serial_number, camera.intrinsics()
     finally:

@@ -7,27 +7,17 @@ from __future__ import annotations
 
 import math
 
-from relmm.robot.body import MAX_OPENING
-
 _CRANK, _ROD = 0.014, 0.024  # m
 _CLOSED_FINGERS = 0.030  # m, between the fingers' carriages when the pads touch
 _MOVE_PWM, _HOLD_PWM = 250, 150  # of 885; what holds does not heat the motor
 _STALL_S, _STALL_WAY = 0.25, 0.0004  # s and m: fingers that move less are stopped by something
 _ARRIVED = 0.0015  # m
-_MAX_CRANK = math.radians(80)  # beyond, the fingers hardly move
 
 
 def opening_of(radians: float) -> float:
     """Between the finger pads, m, for an angle of the motor."""
     finger = _CRANK * math.sin(radians) + math.sqrt(_ROD**2 - (_CRANK * math.cos(radians)) ** 2)
     return 2 * finger - _CLOSED_FINGERS
-
-
-def angle_of(opening: float) -> float:
-    """The motor's angle for an opening, rad; the inverse of `opening_of`."""
-    finger = (min(max(opening, -0.005), MAX_OPENING) + _CLOSED_FINGERS) / 2
-    sine = (finger**2 + _CRANK**2 - _ROD**2) / (2 * _CRANK * finger)
-    return min(math.asin(min(max(sine, -1.0), 1.0)), _MAX_CRANK)
 
 
 class GripperControl:

@@ -77,7 +77,6 @@ class Locobot(LocobotRobot):
         config, measured = self.config, self.measured
         view = camera_geometry(config.camera)
         base_port, arm_port = find_port("base", config.base_port), find_port("arm", config.arm_port)
-        serial_number = None if config.camera_serial == "auto" else config.camera_serial
         _need_serial()
         with contextlib.ExitStack() as opened:
             base = Kobuki(base_port, measured.wheel_scale, config.dry_run)
@@ -85,7 +84,7 @@ class Locobot(LocobotRobot):
             base.wait_until_there()
             arm = WidowX(arm_port, measured.sag_array(), measured.closed_opening, measured.arm_delay, config.dry_run)
             opened.callback(arm.close)
-            camera = D435(serial_number, view, measured.camera_pitch, measured.latency)
+            camera = D435(config.camera_serial, view, measured.camera_pitch, measured.latency)
             opened.callback(camera.close)
             body = LocobotBody(base, arm, camera, view, measured, _print if config.dry_run else None)
             body.start()

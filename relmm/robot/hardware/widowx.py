@@ -40,7 +40,8 @@ _LAY_DOWN_S, _HEAD_S = 2.5, 1.0
 _HEALTH_S = 0.5  # between looks at errors and temperatures
 _GOALS = 10  # looks that are remembered, some 0.4 s
 _RETRIES = 2  # of a read or write whose answer was lost
-ERRORS = {1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload"}
+_ERRORS = {1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload"}
+NO_SDK = "The arm needs dynamixel-sdk: pip install 'lerobot_policy_relmm[hardware]'."
 
 
 @dataclass(frozen=True)
@@ -156,11 +157,8 @@ class WidowX:
         """Where the profiles were as long ago as the joints trail behind them."""
         now = clock.now()
         self._goals.append((now, goal))
-        times = [time for time, _ in self._goals]
-        return np.array([np.interp(now - self._delay, times, joint) for joint in zip(*self._last_goals(), strict=True)])
-
-    def _last_goals(self) -> list[FloatArray]:
-        return [goal for _, goal in self._goals]
+        times, goals = zip(*self._goals, strict=True)
+        return np.array([np.interp(now - self._delay, times, joint) for joint in np.transpose(goals)])
 
     def _angles(self, ticks: dict[str, int]) -> FloatArray:
         return np.array([to_radians(ticks[name]) * (-1 if name in self._mirrored else 1) for name in ARM])
@@ -191,10 +189,9 @@ class WidowX:
         names = tuple(JOINTS)
         for name, error in self._read("Hardware_Error_Status", names).items():
             if error:
-                what = ", ".join(text for bit, text in ERRORS.items() if error & bit) or f"error {error}"
                 raise RobotError(
-                    f"Motor {JOINTS[name].id} ({name}) has switched itself off: {what}. Hold the arm, switch the robot "
-                    "off, free what is stuck, let it cool down, and start again."
+                    f"Motor {JOINTS[name].id} ({name}) has switched itself off: {error_words(error)}. Hold the arm, "
+                    "switch the robot off, free what is stuck, let it cool down, and start again."
                 )
         for name, temperature in self._read("Present_Temperature", names).items():
             if temperature > MAX_TEMPERATURE:
@@ -305,7 +302,7 @@ def _open_bus(port: str) -> LocobotMotorsBus:
         bus = LocobotMotorsBus(port)
         bus.connect()
     except ImportError as error:
-        raise RobotError("The arm needs dynamixel-sdk: pip install 'lerobot_policy_relmm[hardware]'.") from error
+        raise RobotError(NO_SDK) from error
     except (ConnectionError, OSError, RuntimeError, termios.error, IndexError) as error:
         raise RobotError(
             f"Not all motors of the arm answer on {port} ({_first_line(error)}): switch the robot on, check the cable, "
@@ -321,6 +318,11 @@ def load_of(joints: FloatArray) -> FloatArray:
     reach = (corners[:, :2] - corners[0, :2]) @ forward  # m, of elbow, wrist and tool, before the shoulder
     tool = reach[3]
     return np.array([0.0, tool, tool - reach[1], tool - reach[2], 0.0]) / 0.5
+
+
+def error_words(status: int) -> str:
+    """What a motor's Hardware_Error_Status says."""
+    return ", ".join(text for bit, text in _ERRORS.items() if status & bit) or f"error {status}"
 
 
 def _first_line(error: BaseException) -> str:

@@ -23,9 +23,8 @@ from relmm.features import (
     Skill,
     cell_to_xy,
 )
-from relmm.geometry import camera_geometry
+from relmm.geometry import OBJECT_HEIGHT, camera_geometry
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
-from relmm.policies.relmm.floor import OBJECT_HEIGHT
 from relmm.policies.relmm.grasping import FIRST_COLUMN, FIRST_ROW, GraspEnsemble
 from relmm.policies.relmm.memory import PLACES, SIDE, FloorGrid, FloorMemory, cells
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy

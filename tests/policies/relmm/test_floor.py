@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from relmm.features import GRASP_X, GRASP_Y, GRID, cell_to_xy, xy_to_cell
-from relmm.geometry import CAMERAS, CameraGeometry, camera_geometry
-from relmm.policies.relmm.floor import OBJECT_HEIGHT, FloorView
+from relmm.geometry import CAMERAS, OBJECT_HEIGHT, CameraGeometry, camera_geometry
+from relmm.policies.relmm.floor import FloorView
 from relmm.sim.body import SimBody
 from relmm.sim.rooms import make_room
 

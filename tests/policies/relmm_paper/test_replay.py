@@ -119,11 +119,6 @@ def test_step_is_not_known_before_it_has_led_somewhere(numbered, action_of) -> N
     assert lengths == [0, 0, 0, 1]
 
 
-@pytest.mark.parametrize(("life", "count"), [("dff", 0), ("fsf", 2), ("sffs", 4), ("", 0)])
-def test_attempts_are_counted_from_the_first_success_on(life: str, count: int, fill: Fill) -> None:
-    assert fill([life]).attempts_since_first_success == count
-
-
 # --- Ring ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("capacity", [1, 5, 17, 60])
 @pytest.mark.parametrize("seed", range(4))

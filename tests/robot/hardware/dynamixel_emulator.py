@@ -16,6 +16,8 @@ from pathlib import Path
 
 from pty_link import Cable
 
+from relmm.robot.body import MAX_OPENING
+
 BROADCAST = 0xFE
 PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x08, 0x55, 0x82, 0x83
 INSTRUCTION_ERROR, CRC_ERROR, DATA_RANGE, DATA_LENGTH, DATA_LIMIT, ACCESS = 2, 3, 4, 5, 6, 7
@@ -29,6 +31,16 @@ GOAL, MOVING, PRESENT_PWM, LOAD, PRESENT, TRAJECTORY = (116, 4), (122, 1), (124,
 VOLTAGE, TEMPERATURE = (144, 2), (146, 1)
 READ_ONLY = [(0, 7), (70, 71), (120, 147)]
 PWM_MODE = 16
+
+
+CRANK, ROD, CLOSED = 0.014, 0.024, 0.030  # m, of the gripper; the last is between its carriages when the pads touch
+
+
+def angle_of(opening: float) -> float:
+    """The gripper motor's angle for an opening (m) between its pads, rad, at most where the crank stands upright."""
+    finger = (min(max(opening, -0.005), MAX_OPENING) + CLOSED) / 2
+    sine = (finger**2 + CRANK**2 - ROD**2) / (2 * CRANK * finger)
+    return min(math.asin(min(max(sine, -1.0), 1.0)), math.radians(80))
 
 
 def crc16(data: bytes) -> int:

@@ -18,13 +18,12 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from dynamixel_emulator import GOAL_PWM, DynamixelEmulator, locobot_motors
+from dynamixel_emulator import GOAL_PWM, DynamixelEmulator, angle_of, locobot_motors
 from emulated_time import SharedTime
 from kobuki_emulator import TRACK, KobukiEmulator
 
 from relmm.geometry import CAMERAS, CameraGeometry
 from relmm.robot.body import MAX_OPENING
-from relmm.robot.hardware.gripper import angle_of
 from relmm.sim.body import SimBody
 from relmm.sim.rooms import make_room, set_object
 

@@ -34,7 +34,7 @@ def see_floor(fake, pitch: float, spot: tuple[float, float] | None = None) -> tu
 @pytest.mark.parametrize("spot", [(0.40, 0.0), (0.35, 0.06), (0.46, -0.05)])
 def test_pictures_are_those_of_the_known_camera(realsense, pitch, spot):
     realsense.source = lambda: see_floor(realsense, pitch, spot)
-    camera = D435(None, VIEW, pitch, latency=0.0)
+    camera = D435("auto", VIEW, pitch, latency=0.0)
     try:
         rgb, depth = camera.capture()
     finally:
@@ -70,7 +70,7 @@ def test_depth_is_aligned_with_colour(realsense):
     depth[:, 300:340] = 250  # a post
     rgb[:, 300:340] = (0, 0, 255)
     realsense.source = lambda: (rgb, depth)
-    camera = D435(None, VIEW, VIEW.pitch, latency=0.0)
+    camera = D435("auto", VIEW, VIEW.pitch, latency=0.0)
     try:
         color, distance = camera.capture()
     finally:
@@ -86,7 +86,7 @@ def test_pictures_are_newer_than_the_question(realsense):
         return np.full((480, 640, 3), next(count) % 250, np.uint8), np.full((480, 640), 500, np.uint16)
 
     realsense.source = number
-    camera = D435(None, VIEW, VIEW.pitch, latency=0.0)
+    camera = D435("auto", VIEW, VIEW.pitch, latency=0.0)
     try:
         numbers = [int(camera.capture()[0][50, 50, 0]) for _ in range(5)]
     finally:
@@ -104,7 +104,7 @@ def capture_often(camera: D435) -> None:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_unplugged_camera_is_one_sentence(realsense):
     realsense.source = lambda: see_floor(realsense, VIEW.pitch)
-    camera = D435(None, VIEW, VIEW.pitch, latency=0.0)
+    camera = D435("auto", VIEW, VIEW.pitch, latency=0.0)
 
     def gone() -> None:
         raise RuntimeError("No device")
@@ -122,10 +122,10 @@ def test_unplugged_camera_is_one_sentence(realsense):
 def test_none_or_several_cameras_are_one_sentence(realsense, monkeypatch, number, words):
     monkeypatch.setattr(realsense, "plugged", number)
     with pytest.raises(RobotError, match=words):
-        D435(None, VIEW, VIEW.pitch, latency=0.0)
+        D435("auto", VIEW, VIEW.pitch, latency=0.0)
 
 
 def test_machine_without_pyrealsense2_is_told_what_to_do(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyrealsense2", None)
     with pytest.raises(RobotError, match=r"needs pyrealsense2 .* build librealsense"):
-        D435(None, VIEW, VIEW.pitch, latency=0.0)
+        D435("auto", VIEW, VIEW.pitch, latency=0.0)

@@ -19,6 +19,7 @@ from dynamixel_emulator import (
     TEMPERATURE,
     TORQUE,
     DynamixelEmulator,
+    angle_of,
     crc16,
     locobot_motors,
     packet,
@@ -27,7 +28,7 @@ from dynamixel_emulator import (
 from relmm.errors import RobotError
 from relmm.geometry import arm_inverse
 from relmm.robot.hardware.arm_safety import check_way, find_way
-from relmm.robot.hardware.gripper import GripperControl, angle_of, opening_of
+from relmm.robot.hardware.gripper import GripperControl, opening_of
 from relmm.robot.hardware.motors import JOINTS, LocobotMotorsBus
 from relmm.robot.hardware.widowx import SLEEP_POSE, WidowX
 from relmm.robot.skills import REST_POSE
