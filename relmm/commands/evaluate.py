@@ -141,7 +141,7 @@ def evaluate(config: EvalConfig) -> None:
         def show(info: dict[str, Any]) -> None:
             bar.set_description(f"episode {len(scores) + 1}/{config.eval.n_episodes}", refresh=False)
             bar.set_postfix(collected=info["objects_collected"], grasps=info["grasp_attempts"], refresh=False)
-            bar.update(len(scores) * env.navigation_steps + info["navigation_steps"] - bar.n)
+            bar.update(round((len(scores) + share_done(env, info)) * env.navigation_steps) - bar.n)
 
         with suppress(EpisodeStopped):
             for index in range(config.eval.n_episodes):
@@ -157,6 +157,12 @@ def evaluate(config: EvalConfig) -> None:
 def _bar(config: EvalConfig) -> Any:
     assert isinstance(config.env, RelmmRoomEnvConfig)
     return progress(config.eval.n_episodes * config.env.navigation_steps, "step", leave=False)
+
+
+def share_done(env: RelmmRoomEnv, info: dict[str, Any]) -> float:
+    """How much of an episode is over, 0..1: it ends at its last step, or when everything is in the basket."""
+    collected = info["objects_collected"] / info["objects_total"]
+    return float(max(info["navigation_steps"] / env.navigation_steps, collected))
 
 
 def run_episode(

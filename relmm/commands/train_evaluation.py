@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from relmm.commands.evaluate import EpisodeScore, EpisodeStopped, run_episode
+from relmm.commands.evaluate import EpisodeScore, EpisodeStopped, run_episode, share_done
 from relmm.commands.train_config import TrainEvalConfig
 from relmm.learning.actor import Actor
 from relmm.policies.learning import LearningPolicy
@@ -69,7 +69,6 @@ class RoomEvaluation:
         video = self._videos / f"videos_step_{step:06d}" / f"eval_episode_{index}.mp4" if filmed else None
 
         def show(info: dict[str, Any]) -> None:
-            episodes = index + info["navigation_steps"] / self._env.navigation_steps
-            self._show(episodes / self._config.n_episodes)
+            self._show((index + share_done(self._env, info)) / self._config.n_episodes)
 
         return run_episode(self._env, self._actor, self._config.seed + index, video, self._should_stop, show)

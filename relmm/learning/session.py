@@ -12,6 +12,8 @@ from relmm.learning.progress import Metrics, Progress
 from relmm.learning.trainer import Trainer
 from relmm.policies.learning import Learner
 
+_PRACTICE_LOG_FREQ = 10  # attempts of the stationary curriculum between lines of the metrics
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -67,8 +69,11 @@ class Session:
         """Train on a robot until the last step, or until told to stop; ends with a checkpoint."""
         self._begin()
         while trainer.in_stationary_curriculum and not should_stop():
+            before = self._progress.practice_attempts
             trainer.stationary_attempt()
             self._show(self._status())
+            if _passed(before, self._progress.practice_attempts, _PRACTICE_LOG_FREQ):
+                self._log()
         while self._progress.steps < self._schedule.steps and not should_stop():
             before = self._progress.steps
             trainer.navigation_step()

@@ -14,7 +14,12 @@ def write(path, lines):
 
 def counts(steps: int) -> dict[str, float]:
     progress = Progress(steps, attempts=steps // 4, objects=steps // 10, successes=steps // 8)
-    return {**progress.asdict(), "seconds": 0.0}
+    return {**progress.asdict(), "seconds": 0.0, "robot_minutes": steps / 10}
+
+
+def practice(attempts: int) -> dict[str, float]:
+    progress = Progress(practice_attempts=attempts, attempts=attempts, successes=attempts // 2)
+    return {**progress.asdict(), "seconds": 0.0, "robot_minutes": attempts / 10}
 
 
 def test_curve_shows_evaluations_and_training(tmp_path):
@@ -25,6 +30,17 @@ def test_curve_shows_evaluations_and_training(tmp_path):
         draw_learning_curve(tmp_path / f"{name}.jsonl", tmp_path / f"{name}.png")
     full, short = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("full", "short"))
     assert (full < 128).sum() > (short < 128).sum(), "curves are drawn"
+    assert full.shape[1] > 1.5 * short.shape[1], "no panel for evaluations where there was none"
+
+
+def test_curve_of_a_short_run_shows_its_curriculum(tmp_path):
+    write(tmp_path / "practised.jsonl", [practice(attempts) for attempts in range(10, 101, 10)])
+    write(tmp_path / "nothing.jsonl", [])
+    for name in ("practised", "nothing"):
+        draw_learning_curve(tmp_path / f"{name}.jsonl", tmp_path / f"{name}.png")
+    practised, nothing = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("practised", "nothing"))
+    blue = (practised[..., 0].astype(int) - practised[..., 2] > 60).sum()
+    assert blue > 200 > (nothing[..., 0].astype(int) - nothing[..., 2] > 60).sum()
 
 
 def test_half_a_line_is_skipped(tmp_path):
