@@ -266,7 +266,7 @@ class _DataFiles:
 def _numbers(column: pa.ChunkedArray, dtype: DTypeLike) -> NDArray[Any]:
     """A copy, so that it does not keep its whole file in memory; lists are joined."""
     values = column.combine_chunks()
-    if pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
+    while pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
         values = values.flatten()
     numbers = values.to_numpy(zero_copy_only=False).astype(dtype)
     if len(numbers) % max(len(column), 1) or not np.isfinite(numbers).all():

@@ -1,0 +1,1 @@
+"""A package that adds a room to relmm."""
