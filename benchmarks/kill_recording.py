@@ -1,8 +1,8 @@
 """Kills recordings at random instants, and counts which acknowledged episodes LeRobot can read afterwards.
 
-Every round starts a recording (the loop and its writer process, one process group), kills the group with SIGKILL,
-loads the dataset with stock LeRobot as it lies there, and compares every frame. The next round resumes the same
-dataset, which repairs it, and compares again; after ten rounds a new dataset is begun.
+Every round starts a recording, kills it with SIGKILL, loads the dataset with stock LeRobot as it lies there, and
+compares every frame. The next round resumes the same dataset, which repairs it, and compares again; after ten rounds a
+new dataset is begun.
 
     python benchmarks/kill_recording.py --kills 100 --seed 0
 """

@@ -120,8 +120,6 @@ def kill_again_and_again(mode: str, kills: int, folder: Path) -> dict[str, objec
         assert trainer.pid is not None
         os.kill(trainer.pid, signal.SIGKILL)
         trainer.join()
-        if mode == "own":
-            wait(lambda: not (root / "images" / ".lock").exists(), None, log)
         wrong += not check(run, root)
     trainer = start("train", [*resume, f"--steps={int(last.readlink().name) + 3}"], log)
     trainer.join()

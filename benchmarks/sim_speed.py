@@ -159,7 +159,7 @@ def measure_recording(robot: LocobotSim, steps: int, rng: np.random.Generator, c
         recorder = EpisodeRecorder(
             Path(folder) / "dataset", "benchmark/speed", resume=False, depth=False, robot_type=robot.name, info={}
         )
-        with recorder, one_core():
+        with recorder:
             observation, frames = robot.get_observation(), itertools.count(1)
 
             def act() -> None:
@@ -190,9 +190,8 @@ def run(room: str, steps: int, seed: int) -> list[dict[str, Any]]:
         rows["grasping"] = measure_grasping(robot, max(steps // STEPS_PER_GRASP, 1), rng)
     for cores in (2, 1):
         robot.reset(seed)
-        rows[f"navigation, recorded, writer on {'its own' if cores == 2 else 'the same'} core"] = measure_recording(
-            robot, steps, np.random.default_rng(seed), cores
-        )
+        title = f"navigation, recorded, on {cores} core{'s' * (cores - 1)}"
+        rows[title] = measure_recording(robot, steps, np.random.default_rng(seed), cores)
     objects = robot.body.room.num_objects
     robot.disconnect()
     return [{"room": room, "objects": objects, "seed": seed, "task": task, **row} for task, row in rows.items()]

@@ -159,12 +159,6 @@ class DurableDataset:
         self.episodes += 1
         self.pending_frames = 0
 
-    def discard_episode(self) -> None:
-        """Forget the frames since the last saved episode."""
-        self._check_usable()
-        self._dataset.clear_episode_buffer()
-        self.pending_frames = 0
-
     def close(self) -> None:
         """Finish: an unfinished episode is dropped, and other writers may open the dataset."""
         if self._closed:

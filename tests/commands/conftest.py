@@ -4,29 +4,76 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 FIRST_VERSION = Path(__file__).parent / "first_version"  # config.json of its policies
+_PATIENCE_S = 550
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
+@pytest.fixture(scope="session")
+def _server() -> Iterator[Callable[[dict[str, Any]], int]]:
+    """Runs a console script and returns its exit status; see `command_server.py`."""
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def ask(request: dict[str, Any]) -> int:
+        if not processes:
+            script = [sys.executable, "-W", "ignore", str(Path(__file__).with_name("command_server.py"))]
+            processes.append(subprocess.Popen(script, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+        (server,) = processes
+        assert server.stdin is not None
+        assert server.stdout is not None
+        server.stdin.write(json.dumps(request).encode() + b"\n")
+        server.stdin.flush()
+        return int(server.stdout.readline())
+
+    yield ask
+    for process in processes:
+        process.communicate()
+
+
+@pytest.fixture(scope="session")
+def run_in(_server, tmp_path_factory) -> Run:
+    """Run a console script of this environment in a folder."""
+
+    def call(folder: Path, command: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        output = tmp_path_factory.mktemp("output")
+        request = {
+            "command": command,
+            "arguments": arguments,
+            "cwd": str(folder),
+            "environment": environment,
+            "stdout": str(output / "stdout"),
+            "stderr": str(output / "stderr"),
+            "seconds": _PATIENCE_S,
+        }
+        status = _server(request)
+        said, errors = ((output / name).read_text() for name in ("stdout", "stderr"))
+        return subprocess.CompletedProcess([command, *arguments], status, said, errors)
+
+    return call
+
+
 @pytest.fixture
-def run(tmp_path: Path) -> Run:
+def run(tmp_path: Path, run_in: Run) -> Run:
     """Run a console script of this environment in a folder of its own."""
 
     def call(command: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        script = Path(sys.executable).parent / command
+        if command.startswith(("relmm-", "lerobot-")) and not any(name.startswith("HF_") for name in environment):
+            return run_in(tmp_path, command, *arguments, **environment)
+        # Hugging Face's libraries read their settings when they are imported, so this takes a process of its own.
         return subprocess.run(
-            [str(script), *arguments],
+            [str(Path(sys.executable).parent / command), *arguments],
             capture_output=True,
             text=True,
             cwd=tmp_path,
             env={**os.environ, **environment},
             stdin=subprocess.DEVNULL,
-            timeout=550,
+            timeout=_PATIENCE_S,
         )
 
     return call

@@ -2,8 +2,6 @@
 
 import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pandas as pd
@@ -145,11 +143,9 @@ def test_nothing_is_overwritten(root, tmp_path):
         analyze(tmp_path / "missing", tmp_path / "new")
 
 
-def test_mistakes_end_in_a_sentence(tmp_path):
+def test_mistakes_end_in_a_sentence(run):
     for arguments, words in [([], "Say which dataset"), (["--dataset.root=x"], "Say where the report goes")]:
-        done = subprocess.run(
-            [sys.executable, "-m", "relmm.commands.analyze", *arguments], capture_output=True, text=True, timeout=300
-        )
+        done = run("relmm-analyze", *arguments)
         assert done.returncode == 2
         assert words in done.stderr
         assert "Traceback" not in done.stderr

@@ -4,7 +4,6 @@ import contextlib
 import json
 import shutil
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -27,11 +26,13 @@ LAST_DATA, LAST_EPISODE = "data/*/*.parquet", "meta/episodes/*/*.parquet"
 
 
 @pytest.fixture(scope="module")
-def first_run(tmp_path_factory, tiny) -> Path:
+def first_run(run_in, tmp_path_factory, tiny) -> Path:
     """Four navigation steps of a run, of which the middle checkpoint is kept, too."""
     folder = tmp_path_factory.mktemp("resume") / "run"
-    command = [sys.executable, "-m", "relmm.commands.train", *tiny, "--steps=4", "--save_freq=2", "--max_steps=3"]
-    subprocess.run([*command, f"--output_dir={folder}"], check=True, capture_output=True, timeout=300)
+    result = run_in(
+        folder.parent, "relmm-train", *tiny, "--steps=4", "--save_freq=2", "--max_steps=3", f"--output_dir={folder}"
+    )
+    assert result.returncode == 0, result.stderr
     return folder
 
 

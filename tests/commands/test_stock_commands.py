@@ -1,7 +1,5 @@
 """LeRobot's own commands, unmodified, on relmm's robot, policies, environment and datasets."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,23 +14,13 @@ ROBOT = ("--robot.type=locobot_sim", "--robot.room=diverse")
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> Path:
+def recorded(run_in, tmp_path_factory) -> Path:
     """A small dataset written by relmm-record."""
-    root = tmp_path_factory.mktemp("recorded") / "room"
-    script = Path(sys.executable).parent / "relmm-record"
-    subprocess.run(
-        [
-            str(script),
-            *ROBOT,
-            "--policy.type=relmm_random",
-            "--max_steps=4",
-            "--dataset.num_episodes=3",
-            "--dataset.repo_id=me/room",
-            f"--dataset.root={root}",
-        ],
-        check=True,
-    )
-    return root
+    folder = tmp_path_factory.mktemp("recorded")
+    arguments = ["--policy.type=relmm_random", "--max_steps=4", "--dataset.num_episodes=3"]
+    dataset = ["--dataset.repo_id=me/room", "--dataset.root=room"]
+    assert run_in(folder, "relmm-record", *ROBOT, *arguments, *dataset).returncode == 0
+    return folder / "room"
 
 
 def test_what_lerobot_record_has_recorded_can_be_learned_from(run, tmp_path):

@@ -15,7 +15,6 @@ from episode_children import (
     die_after_renames,
     die_in_first_save,
     fill_limited_files,
-    hand_over_and_be_killed,
     record_until_killed,
 )
 from episode_helpers import REPO_ID, TASK, arguments, check_dataset, length_of, load, new_dataset, record
@@ -117,20 +116,9 @@ def test_a_full_disk(small_disk):
     check_dataset(root, recorder.saved_episodes)
 
 
-def test_the_writer_outlives_a_killed_recording(tmp_path, forkserver):
-    root = tmp_path / "d"
-    new_dataset(root, 1)
-    assert run(forkserver, hand_over_and_be_killed, root, 3) == -signal.SIGKILL
-    deadline = time.monotonic() + 20
-    while (root / "images").exists():  # the lock of the writer is in there until it ends
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    check_dataset(root, 4)
-
-
 @pytest.mark.slow
 def test_kills_of_a_whole_recording(tmp_path):
-    """A few rounds of the benchmark: it kills recorder and writer at once."""
+    """A few rounds of the benchmark."""
     table = tmp_path / "kills.csv"
     script = PROJECT / "benchmarks" / "kill_recording.py"
     command = [sys.executable, str(script), "--kills", "3", "--seed", "5", "--output", str(table)]
