@@ -13,6 +13,7 @@ import numpy as np
 from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, now, run
 from relmm.commands.curve import draw_learning_curve
+from relmm.commands.display import live_views
 from relmm.commands.hub_resume import take_over_from_hub
 from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
@@ -71,13 +72,21 @@ def _train_on_robot(run: Run) -> None:
     robot = make_locobot(replace(config.robot), seed, "relmm-train")
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
-        with _recorder(run, robot, seed) as recorder:
+        with (
+            live_views(config, "relmm-train", robot.config.camera, run.actor, learning=True) as views,
+            _recorder(run, robot, seed) as recorder,
+        ):
+            run.listeners += [view.show_metrics for view in views]
             run.read_own_data()  # now that nobody else writes to it
             if damaged:
                 run.save(recorder.saved_episodes)
             pause = Pause(robot, lambda: run.signals.stopped)
             life = Life(
-                robot, [recorder, run.learner, run.progress], robot.seconds, config.max_steps, should_stop=pause
+                robot,
+                [recorder, run.learner, run.progress, *views],
+                robot.seconds,
+                config.max_steps,
+                should_stop=pause,
             )
             person = _person(robot, seed)
 

@@ -10,6 +10,7 @@ from lerobot.robots.config import RobotConfig
 
 from relmm.commands.arguments import said
 from relmm.commands.cli import dated_folder
+from relmm.commands.display import DisplayOptions
 from relmm.commands.policies import check_camera, policy_from_path
 from relmm.commands.upload import LICENSE
 from relmm.episodes import MAX_STEPS, check_repo_id
@@ -106,7 +107,7 @@ class TrainEvalConfig:
 
 
 @dataclass
-class TrainConfig:
+class TrainConfig(DisplayOptions):
     """Train ReLMM online on a robot.
 
     Args:
@@ -173,6 +174,7 @@ class TrainConfig:
         if self.policy.seed is None:
             self.policy.seed = self.seed
         self._check_uploads()
+        self._check_display()
         self._choose_folder()
 
     def _check_uploads(self) -> None:
@@ -191,6 +193,11 @@ class TrainConfig:
                 f"hub.every is {self.hub.every}, but nothing is uploaded: also say --policy.push_to_hub=true "
                 "--policy.repo_id=user/name, or --dataset.push_to_hub=true."
             )
+
+    def _check_display(self) -> None:
+        if self.display_data and self.robot is None:
+            raise ConfigError("There is no robot here to display: say --display_data=true to the one that records.")
+        self.check_display()
 
     def _choose_folder(self) -> None:
         if self.output_dir is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import draccus
 import numpy as np
 
 from relmm.commands.cli import StopOnSignal, progress
+from relmm.commands.display import DisplayOptions
 from relmm.commands.policies import make_actor
 from relmm.commands.sharing import Uploads, run_arguments
 from relmm.commands.train_config import TrainConfig
@@ -52,7 +54,7 @@ class Run:
     def __init__(self, config: TrainConfig, signals: StopOnSignal) -> None:
         assert isinstance(config.policy, LearningConfig)
         self.config, self.signals = config, signals
-        self.saved_config = _settings_to_keep(config)
+        self.saved_config = settings_to_keep(config)
         self.checkpoint = last_checkpoint(config.checkpoints) if config.resume else None
         if self.checkpoint is not None:
             check_same_networks(self.checkpoint, config.policy.fingerprint())
@@ -70,6 +72,7 @@ class Run:
         if self.checkpoint is not None:
             counters = load_training_state(self.checkpoint, self.learner, self.rng)
             self.learned, self.progress.interventions = counters["episodes"], counters.get("interventions", 0)
+        self.listeners: list[Callable[[dict[str, Any]], None]] = []  # to the metrics
         assert config.output_dir is not None
         self.uploads = Uploads(run_arguments(config), config.output_dir)
 
@@ -162,7 +165,7 @@ class Run:
             bar.advance("steps", status["steps"], words)
             self.uploads.check()
 
-        metrics = Metrics(config.output_dir / "metrics.jsonl")
+        metrics = Metrics(config.output_dir / "metrics.jsonl", self.listeners)
         return Session(
             schedule,
             self.progress,
@@ -175,9 +178,11 @@ class Run:
         )
 
 
-def _settings_to_keep(config: TrainConfig) -> dict[str, Any]:
+def settings_to_keep(config: TrainConfig) -> dict[str, Any]:
     """For a resume, which may come from another folder: as given, but with whole paths."""
     settings: dict[str, Any] = draccus.encode(config)
+    for option in fields(DisplayOptions):  # who looks on today need not look on after a resume
+        del settings[option.name]
     dataset = settings["dataset"]
     for name in ("root", "follow", "init"):
         # What does not exist yet is a folder, too, but for `init`: that may be a name on the Hub.
