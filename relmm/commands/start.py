@@ -35,6 +35,7 @@ relmm-train: a robot is put into a room and learns to clean it.
   --dataset.push_to_hub=true    upload it
   --policy.push_to_hub=true     upload the checkpoint to --policy.repo_id=USER/NAME
   --hub.every=STEPS             upload while training, too
+  --wandb.enable=true           also log to Weights & Biases; --wandb.mode=offline without an account
   --display_data=true           see what the robot sees and believes, in a viewer of rerun
   --display_path=FILE.rrd       in a file for that viewer instead
 """,

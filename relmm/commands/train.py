@@ -59,8 +59,7 @@ def train(config: TrainConfig) -> None:
     draw_learning_curve(config.output_dir / "metrics.jsonl", config.output_dir / "learning_curve.png")
     kept = "checkpoints, metrics" if config.robot is None else "checkpoints, metrics, dataset"
     print(f"{kept} and learning_curve.png: {config.output_dir}")
-    run.uploads.say = print
-    run.uploads.finish()
+    run.finish()
 
 
 def _train_on_robot(run: Run) -> None:
@@ -72,6 +71,7 @@ def _train_on_robot(run: Run) -> None:
     robot = make_locobot(replace(config.robot), seed, "relmm-train")
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
+        run.track()
         with (
             live_views(config, "relmm-train", robot.config.camera, run.actor, learning=True) as views,
             _recorder(run, robot, seed) as recorder,
@@ -182,6 +182,7 @@ def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:
 def _train_on_stream(run: Run, root: Path) -> None:
     run.check_cursor(saved_episodes(root))
     run.read_initial_data()
+    run.track()
     follower = EpisodeFollower(root, run.read_own_data(), run.policy.config.camera)
 
     def episodes() -> Iterator[Episode]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lerobot.configs.default import WandBConfig
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
@@ -12,6 +13,7 @@ from relmm.commands.arguments import said
 from relmm.commands.cli import dated_folder
 from relmm.commands.display import DisplayOptions
 from relmm.commands.policies import check_camera, policy_from_path
+from relmm.commands.tracking import check_tracking
 from relmm.commands.upload import LICENSE
 from relmm.episodes import MAX_STEPS, check_repo_id
 from relmm.errors import MANY, MAX_SEED, ConfigError, check_range, suggestion
@@ -117,6 +119,7 @@ class TrainConfig(DisplayOptions):
         curriculum: `--curriculum.type=stationary`, `autonomous` or `none`.
         eval: evaluation while training.
         hub: when to upload; what, is said with `--policy.push_to_hub`, `--policy.repo_id`, `--dataset.push_to_hub`.
+        wandb: also log to Weights & Biases, as lerobot-train does.
         steps: navigation steps to train for, those of earlier runs included.
         seed: of everything random; equal seeds give equal runs.
         output_dir: a folder that does not exist yet; None for outputs/train/DATE/TIME_JOB.
@@ -138,6 +141,7 @@ class TrainConfig(DisplayOptions):
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
     hub: HubConfig = field(default_factory=HubConfig)
+    wandb: WandBConfig = field(default_factory=WandBConfig)
     steps: int = 2000
     seed: int = 0
     output_dir: Path | None = None
@@ -175,6 +179,7 @@ class TrainConfig(DisplayOptions):
             self.policy.seed = self.seed
         self._check_uploads()
         self._check_display()
+        check_tracking(self.wandb)
         self._choose_folder()
 
     def _check_uploads(self) -> None:

@@ -14,6 +14,7 @@ from relmm.commands.cli import StopOnSignal, progress
 from relmm.commands.display import DisplayOptions
 from relmm.commands.policies import make_actor
 from relmm.commands.sharing import Uploads, run_arguments
+from relmm.commands.tracking import Tracker
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.training_bar import EVALUATION_WEIGHT, PRACTICE_WEIGHT, Phase, TrainingBar
 from relmm.episodes import (
@@ -74,6 +75,7 @@ class Run:
             self.learned, self.progress.interventions = counters["episodes"], counters.get("interventions", 0)
         self.listeners: list[Callable[[dict[str, Any]], None]] = []  # to the metrics
         assert config.output_dir is not None
+        self._tracker: Tracker | None = None
         self.uploads = Uploads(run_arguments(config), config.output_dir)
 
     @property
@@ -127,7 +129,7 @@ class Run:
             episodes: of the run's dataset that the weights have learned from; a resumed run learns the later ones.
         """
         counters = {"episodes": episodes, "interventions": self.progress.interventions}
-        save_checkpoint(
+        checkpoint = save_checkpoint(
             self.config.checkpoints,
             self.progress.steps,
             self.actor,
@@ -137,6 +139,25 @@ class Run:
             self.saved_config,
             recorded_runs(DatasetFolder(self.data)),
         )
+        if self._tracker is not None:
+            self._tracker.log_checkpoint(checkpoint)
+
+    def track(self) -> None:
+        """Begin to log to Weights & Biases, if that is asked for; to be called when the run is sure to begin.
+
+        Raises:
+            ConfigError: it cannot be.
+        """
+        if self.config.wandb.enable:
+            self._tracker = Tracker(self.config, self.saved_config)
+            self.listeners.append(self._tracker.log)
+
+    def finish(self) -> None:
+        """Send to others what they have not got yet."""
+        if self._tracker is not None:
+            self._tracker.finish()
+        self.uploads.say = print
+        self.uploads.finish()
 
     def bar(self, title: str) -> TrainingBar:
         """A progress bar of the whole run, what was done before a resume included."""
