@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from relmm.analysis.predictions import Sample
+from relmm.analysis.collection import Sample
 from relmm.features import GRASP_X, GRASP_Y, GRID
 
 INK = "#010203"  # replaced by the page's colour of text

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import shlex
-from importlib.resources import files
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,11 @@ _DPI = 150
 
 
 def write_report(
-    output: Path, collection: Collection, summary: dict[str, Any], other: tuple[str, str, dict[str, Any]] | None = None
+    output: Path,
+    collection: Collection,
+    summary: dict[str, Any],
+    other: tuple[str, str, dict[str, Any]] | None = None,
+    files: bool = True,
 ) -> None:
     """Write `figures/`, `summary.json` and last `report.html`, each whole or not at all.
 
@@ -36,6 +40,7 @@ def write_report(
         collection: the attempts.
         summary: of `summarize_collection`.
         other: name of this report and of another one, and the summary of that, to compare with.
+        files: also write `figures/`; else the pictures are only in the page.
     """
     made = figures(summary, collection.samples)
     comparison = None
@@ -43,8 +48,9 @@ def write_report(
         comparison, picture = compare(summary, other[2], other[:2])
         made["comparison"] = picture
         summary = {**summary, "comparison": comparison}
-    folder = output / "figures"
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = output / "figures" if files else None
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
     drawn = {name: _save(figure, name, folder) for name, figure in made.items()}
     _replace(output / SUMMARY, json.dumps(summary, indent=2, allow_nan=False))
     _replace(output / REPORT, render(summary, drawn, _surprising(output / GRASPS, summary)))
@@ -58,22 +64,24 @@ def render(summary: dict[str, Any], drawn: dict[str, str], surprising: list[dict
         drawn: SVG by name.
         surprising: rows with a picture, as a data URL, and a command.
     """
-    template = files("relmm.analysis").joinpath("report.html.j2").read_text(encoding="utf-8")
+    template = resources.files("relmm.analysis").joinpath("report.html.j2").read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(template).render(
         summary=summary, says=sentences(summary), figures=drawn, surprising=surprising
     )
 
 
-def _save(figure: Figure, name: str, folder: Path) -> str:
-    """Write a picture as PNG and SVG; returns the SVG for the page."""
+def _save(figure: Figure, name: str, folder: Path | None) -> str:
+    """Write a picture as PNG and SVG, if there is a folder; returns the SVG for the page."""
     import matplotlib as mpl
 
     with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
-        figure.savefig(folder / f"{name}.png", dpi=_DPI, facecolor="white")
+        if folder is not None:
+            figure.savefig(folder / f"{name}.png", dpi=_DPI, facecolor="white")
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    _replace(folder / f"{name}.svg", text.getvalue())
+    if folder is not None:
+        _replace(folder / f"{name}.svg", text.getvalue())
     svg = text.getvalue()[text.getvalue().index("<svg") :].replace(INK, "currentColor")
     # Names of elements are counted from one in every picture, and there are several in the page.
     svg = re.sub(r'(id="|xlink:href="#|url\(#)', rf"\g<1>{name}-", svg)

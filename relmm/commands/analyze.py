@@ -174,7 +174,6 @@ def _summary(collection: Collection, config: AnalyzeConfig) -> dict[str, Any]:
         **summarize_collection(collection, config.dataset.name),
         "where": config.where,
         "policy_path": path,
-        "comparison": None,
     }
 
 

@@ -130,6 +130,7 @@ class TrainConfig(DisplayOptions):
         log_freq: navigation steps between lines of `metrics.jsonl`.
         max_steps: navigation steps after which an episode is cut off.
         pseudo_reset_steps: navigation steps, at most, before and after a picked-up object is put down again.
+        report: keep a `report.html` as relmm-analyze writes it in the output folder, refreshed in the background.
         replay_frames: newest attempts (relmm, 1.6 kB each), or attempts and navigation steps (relmm_paper, 30 kB and at
             most 60 kB), to learn from, kept in memory.
         num_threads: of torch; 1 is the fastest on few cores.
@@ -152,6 +153,7 @@ class TrainConfig(DisplayOptions):
     log_freq: int = 50
     max_steps: int = 250
     pseudo_reset_steps: int = 20
+    report: bool = True
     replay_frames: int = 100_000
     num_threads: int = 1
 

@@ -10,6 +10,7 @@ from typing import Any
 import draccus
 import numpy as np
 
+from relmm.analysis.report import REPORT
 from relmm.commands.cli import StopOnSignal, progress
 from relmm.commands.display import DisplayOptions
 from relmm.commands.policies import make_actor
@@ -17,6 +18,7 @@ from relmm.commands.sharing import Uploads, run_arguments
 from relmm.commands.tracking import Tracker
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.training_bar import EVALUATION_WEIGHT, PRACTICE_WEIGHT, Phase, TrainingBar
+from relmm.commands.training_report import TrainingReport
 from relmm.episodes import (
     Episode,
     check_trainable,
@@ -76,6 +78,8 @@ class Run:
         self.listeners: list[Callable[[dict[str, Any]], None]] = []  # to the metrics
         assert config.output_dir is not None
         self._tracker: Tracker | None = None
+        page = config.output_dir / REPORT
+        self._report = TrainingReport(self.data, config.dataset.repo_id, page) if config.report else None
         self.uploads = Uploads(run_arguments(config), config.output_dir)
 
     @property
@@ -141,6 +145,8 @@ class Run:
         )
         if self._tracker is not None:
             self._tracker.log_checkpoint(checkpoint)
+        if self._report is not None and episodes:
+            self._report.refresh()
 
     def track(self) -> None:
         """Begin to log to Weights & Biases, if that is asked for; to be called when the run is sure to begin.
@@ -153,7 +159,10 @@ class Run:
             self.listeners.append(self._tracker.log)
 
     def finish(self) -> None:
-        """Send to others what they have not got yet."""
+        """Make the report of all there is, and send to others what they have not got yet."""
+        if self._report is not None and self.progress.attempts:
+            self._report.say = print
+            self._report.finish()
         if self._tracker is not None:
             self._tracker.finish()
         self.uploads.say = print
@@ -179,12 +188,16 @@ class Run:
         assert config.output_dir is not None
         schedule = Schedule(config.steps, config.log_freq, config.save_freq, config.env_eval_freq, config.hub.every)
         self.uploads.say = bar.write
+        if self._report is not None:
+            self._report.say = bar.write
 
         def show(status: dict[str, Any]) -> None:
             words = f"{status['objects']} objects, {status['successes']}/{status['attempts']} grasps"
             bar.advance("practice", status["practice_attempts"], words)
             bar.advance("steps", status["steps"], words)
             self.uploads.check()
+            if self._report is not None:
+                self._report.check()
 
         metrics = Metrics(config.output_dir / "metrics.jsonl", self.listeners)
         return Session(
