@@ -153,7 +153,7 @@ def _calibration(numbers: dict[str, Any]) -> Figure:
     best = numbers["mean"] or numbers["p_grasp"]
     for name, colour, label in (("p_grasp", _ORANGE, "P[grasp]"), ("mean", _BLUE, "mean at the spot")):
         if numbers[name] is not None:
-            _reliability(left, numbers[name]["bins"], colour, label)
+            reliability_curve(left, numbers[name]["bins"], colour, label)
     left.set(xlabel="expected, %", ylabel="picked up, %", xlim=(0, 100), ylim=(0, 100), title="expected and happened")
     left.legend(fontsize=8, loc="upper left")
     _threshold(middle, best["thresholds"])
@@ -166,7 +166,8 @@ def _calibration(numbers: dict[str, Any]) -> Figure:
     return figure
 
 
-def _reliability(ax: Any, bins: dict[str, list[float]], colour: str, label: str) -> None:
+def reliability_curve(ax: Any, bins: dict[str, list[float]], colour: str, label: str) -> None:
+    """Expectations against outcomes, with intervals."""
     observed = np.array(bins["observed"])
     ends = np.abs(np.array([bins["low"], bins["high"]]) - observed) * 100
     ax.errorbar(

@@ -16,6 +16,7 @@ from relmm.commands.policies import check_camera, policy_from_path
 from relmm.commands.tracking import check_tracking
 from relmm.commands.upload import LICENSE
 from relmm.episodes import MAX_STEPS, check_repo_id
+from relmm.episodes.folder import OWN_DATASET
 from relmm.errors import MANY, MAX_SEED, ConfigError, check_range, suggestion
 from relmm.learning.curriculum import CURRICULA
 from relmm.policies.learning import LearningConfig
@@ -226,7 +227,7 @@ class TrainConfig(DisplayOptions):
     def dataset_root(self) -> Path:
         """The folder of the robot's life."""
         assert self.output_dir is not None
-        return self.dataset.root or self.output_dir / "dataset"
+        return self.dataset.root or self.output_dir / OWN_DATASET
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:

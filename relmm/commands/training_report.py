@@ -72,19 +72,22 @@ class TrainingReport:
             self._process.terminate()
             self._process.wait()
             self._process = None
+        try:
+            self._write()
+            self.say(f"report: {self._page}")
+        except KeyboardInterrupt:
+            self._say_failed("it was stopped")
+        except Exception as error:  # whatever it is, the run has ended well
+            self._say_failed(str(error) or type(error).__name__)
+
+    def _write(self) -> None:
         with closing(progress(0, "frame", "writing the report", leave=False)) as bar:
 
             def show(frames: int, total: int) -> None:
                 bar.total = total
                 bar.update(frames)
 
-            try:
-                write_page(self._root, self._name, self._page, show)
-                self.say(f"report: {self._page}")
-            except KeyboardInterrupt:
-                self._say_failed("it was stopped")
-            except Exception as error:  # whatever it is, the run has ended well
-                self._say_failed(str(error) or type(error).__name__)
+            write_page(self._root, self._name, self._page, show)
 
     def _say_failed(self, why: str) -> None:
         words = " ".join(why.split()).rstrip(".")
