@@ -223,7 +223,7 @@ def _track(lines: list[dict[str, Any]]) -> Figure:
         jumps = np.hypot(np.diff(x), np.diff(y)) > 1.0  # carried by a person, or a new run
         breaks = np.flatnonzero(jumps) + 1
         for piece in zip(np.split(x, breaks), np.split(y, breaks), strict=True):
-            ax.plot(-piece[1], piece[0], lw=0.5, alpha=0.7, color=f"C{line['run'] % 10}")
+            ax.plot(-piece[1], piece[0], lw=0.8, alpha=0.8, color=f"C{line['run'] % 10}")
     ax.set(xlabel="right of where it began, m", ylabel="forward of where it began, m", aspect="equal")
     return figure
 

@@ -46,21 +46,22 @@ def write_report(
         folder.mkdir(parents=True, exist_ok=True)
     drawn = {name: draw(figure, name, folder) for name, figure in made.items()}
     replace(output / SUMMARY, json.dumps(summary, indent=2, allow_nan=False))
-    replace(output / REPORT, render(summary, drawn, _surprising(output / GRASPS, summary)))
+    replace(output / REPORT, render(summary, drawn, _surprising(output / GRASPS, summary), files))
 
 
-def render(summary: dict[str, Any], drawn: dict[str, Drawn], surprising: list[dict[str, Any]]) -> str:
+def render(summary: dict[str, Any], drawn: dict[str, Drawn], surprising: list[dict[str, Any]], files: bool) -> str:
     """The page.
 
     Args:
         summary: every number.
         drawn: the pictures, by name.
         surprising: rows with a picture, as a data URL, and a command.
+        files: whether there are others beside it.
     """
     template = resources.files("relmm.analysis").joinpath("report.html.j2").read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(template).render(
-        summary=summary, says=sentences(summary), figures=drawn, surprising=surprising
+        summary=summary, says=sentences(summary), figures=drawn, surprising=surprising, files=files
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from relmm.commands import training_report
 from relmm.commands.training_report import TrainingReport
 
-SAMPLE = Path(__file__).parents[2] / "datasets" / "diverse_scripted"
+SAMPLE = Path(__file__).parents[2] / "datasets" / "first_attempts"
 
 
 class Process:
