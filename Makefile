@@ -14,7 +14,7 @@ PIP_INSTALL := -m pip install --quiet --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint constraints clean
+.PHONY: help setup demo sample test test-slow lint constraints clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -41,6 +41,13 @@ demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (so
 	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/last/pretrained_model --env.room=no_obstacles \
 	  --eval.n_episodes=2 --seed=0 --output_dir=$(DEMO_DIR)/after
 	@$(BIN)/python -m relmm.commands.demo $(DEMO_DIR)/before $(DEMO_DIR)/after $(DEMO_DIR)/before_and_after.mp4
+
+sample: $(STAMP) ## make the dataset of datasets/ again, in outputs/sample/first_attempts (some minutes)
+	$(BIN)/relmm-train --robot.type=locobot_sim --robot.room=diverse --curriculum.type=autonomous \
+	  --policy.num_max=260 --steps=100 --pseudo_reset_steps=1 --env_eval_freq=0 --seed=0 \
+	  --dataset.repo_id=relmm/first_attempts --output_dir=outputs/sample
+	@$(BIN)/python -c "from pathlib import Path; from relmm.episodes.compact import compact; \
+	  compact('outputs/sample/dataset', Path('outputs/sample/first_attempts'))"
 
 test: $(STAMP) ## run the tests, but not the slow ones
 	$(PYTEST) -n $(JOBS) --dist loadfile

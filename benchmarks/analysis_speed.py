@@ -79,7 +79,7 @@ def measure(root: Path, output: Path, policy: str | None) -> dict[str, float]:
 def main() -> None:
     """Measure, print and append."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--source", type=Path, default=ROOT / "datasets/diverse_scripted")
+    parser.add_argument("--source", type=Path, default=ROOT / "datasets/first_attempts")
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--policy", help="a checkpoint's pretrained_model")
     arguments = parser.parse_args()

@@ -22,7 +22,7 @@ from relmm.episodes import DurableDataset, compact
 from relmm.episodes.settings import LEROBOT_COLUMNS
 from relmm.features import IMAGE_KEY
 
-SAMPLE = Path(__file__).parents[1] / "datasets" / "diverse_scripted"
+SAMPLE = Path(__file__).parents[1] / "datasets" / "first_attempts"
 OUTPUT = Path(__file__).parent / "results" / "long_life.csv"
 REPO_ID, LENGTH, DEFAULT_FRAMES = "local/long_life", 13, 20_000
 

@@ -7,19 +7,22 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from relmm.analysis.pictures import Viewer
-from relmm.analysis.predictions import Predictor, Sample
 from relmm.analysis.reading import Columns, Reader, cells_of, with_consequences
 from relmm.episodes.pictures import decode_picture
 from relmm.features import GRID, IMAGE_KEY, FloatArray, Skill
+
+if TYPE_CHECKING:  # torch takes seconds, and most reports need none
+    from relmm.analysis.predictions import Predictor
 
 GRASPS, STEPS = "grasps.parquet", "steps.parquet"
 # fmt: off
@@ -29,6 +32,26 @@ _STEP_COLUMNS = [
 ]
 # fmt: on
 _SAMPLES = 3  # pictures with a policy's maps, of successes and of failures each
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """An attempt with the map that a policy had of it.
+
+    Attributes:
+        episode, frame: where it is in the dataset.
+        success: whether it picked something up.
+        cell: attempted, -1 outside the grasp area.
+        image: the whole picture, (100, 100, 3).
+        mean: the policy's, of each cell, (225,).
+    """
+
+    episode: int
+    frame: int
+    success: bool
+    cell: int
+    image: NDArray[np.uint8]
+    mean: FloatArray
 
 
 @dataclass

@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from relmm.analysis.predictions import Sample
+from relmm.analysis.collection import Sample
 from relmm.features import GRASP_X, GRASP_Y, GRID
 
 INK = "#010203"  # replaced by the page's colour of text
@@ -153,7 +153,7 @@ def _calibration(numbers: dict[str, Any]) -> Figure:
     best = numbers["mean"] or numbers["p_grasp"]
     for name, colour, label in (("p_grasp", _ORANGE, "P[grasp]"), ("mean", _BLUE, "mean at the spot")):
         if numbers[name] is not None:
-            _reliability(left, numbers[name]["bins"], colour, label)
+            reliability_curve(left, numbers[name]["bins"], colour, label)
     left.set(xlabel="expected, %", ylabel="picked up, %", xlim=(0, 100), ylim=(0, 100), title="expected and happened")
     left.legend(fontsize=8, loc="upper left")
     _threshold(middle, best["thresholds"])
@@ -166,7 +166,8 @@ def _calibration(numbers: dict[str, Any]) -> Figure:
     return figure
 
 
-def _reliability(ax: Any, bins: dict[str, list[float]], colour: str, label: str) -> None:
+def reliability_curve(ax: Any, bins: dict[str, list[float]], colour: str, label: str) -> None:
+    """Expectations against outcomes, with intervals."""
     observed = np.array(bins["observed"])
     ends = np.abs(np.array([bins["low"], bins["high"]]) - observed) * 100
     ax.errorbar(
@@ -222,7 +223,7 @@ def _track(lines: list[dict[str, Any]]) -> Figure:
         jumps = np.hypot(np.diff(x), np.diff(y)) > 1.0  # carried by a person, or a new run
         breaks = np.flatnonzero(jumps) + 1
         for piece in zip(np.split(x, breaks), np.split(y, breaks), strict=True):
-            ax.plot(-piece[1], piece[0], lw=0.5, alpha=0.7, color=f"C{line['run'] % 10}")
+            ax.plot(-piece[1], piece[0], lw=0.8, alpha=0.8, color=f"C{line['run'] % 10}")
     ax.set(xlabel="right of where it began, m", ylabel="forward of where it began, m", aspect="equal")
     return figure
 

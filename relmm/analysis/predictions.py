@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,26 +14,6 @@ from relmm.policies.relmm.grasping import GraspEnsemble
 from relmm.policies.relmm_paper.grasping import GraspEnsemble as PaperEnsemble
 
 _BATCH = 64
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """An attempt with the map that a policy had of it.
-
-    Attributes:
-        episode, frame: where it is in the dataset.
-        success: whether it picked something up.
-        cell: attempted, -1 outside the grasp area.
-        image: the whole picture, (100, 100, 3).
-        mean: the policy's, of each cell, (225,).
-    """
-
-    episode: int
-    frame: int
-    success: bool
-    cell: int
-    image: NDArray[np.uint8]
-    mean: FloatArray
 
 
 class Predictor:

@@ -140,10 +140,9 @@ def _judgements(grasps: pd.DataFrame, keep: str) -> dict[str, Any] | None:
 def _stretches(grasps: pd.DataFrame, keep: str) -> list[dict[str, Any]]:
     found = []
     for stretch in dry_stretches(grasps)[:3]:
-        words = (
-            f"{stretch['attempts']} attempts in a row failed, in episodes {stretch['first_episode']} to "
-            f"{stretch['last_episode']}, where chance would hardly make so many"
-        )
+        first, last = stretch["first_episode"], stretch["last_episode"]
+        where = f"in episode {first}" if first == last else f"in episodes {first} to {last}"
+        words = f"{stretch['attempts']} attempts in a row failed, {where}, where chance would hardly make so many"
         command = f"{keep}'not ({stretch['first_index']} <= index <= {stretch['last_index']})'"
         found.append(_finding("no_success", words, stretch["attempts"], command, **stretch))
     return found

@@ -18,6 +18,7 @@ def sentences(summary: dict[str, Any]) -> dict[str, str]:
         "policy": _policy(summary["policy"]),
         "surprises": _surprises(summary["surprises"]),
         "time": _time(summary["time"]),
+        "comparison": _comparison(summary["comparison"]),
         "collected_by": _collected_by(summary["collected_by"]),
         "findings": _findings(summary["findings"]),
         "next": _next(summary["next"]) if some else nothing,
@@ -127,6 +128,33 @@ def _surprises(numbers: dict[str, Any]) -> str:
         f"Of the {len(rows)} least expected outcomes, {failures} are failures of attempts that looked good, and "
         f"{len(rows) - failures} successes of attempts that did not. A judgement that is wrong would be among them."
     )
+
+
+def _comparison(numbers: dict[str, Any] | None) -> str:
+    if numbers is None:
+        return ""
+    here, there = numbers["names"]
+    if numbers["success"] is not None:
+        return _more_successes(numbers["success"], here, there)
+    if numbers["score"] is not None:
+        return _better_score(numbers["score"], here, there)
+    return "There are too few attempts that neither has learned from to tell them apart." * numbers["same_attempts"]
+
+
+def _more_successes(change: dict[str, float], here: str, there: str) -> str:
+    points = f"{100 * abs(change['difference']):.0f} points {'more' if change['difference'] > 0 else 'less'} often"
+    text = f"{there} succeeds {points} than {here} ({100 * change['low']:+.0f} to {100 * change['high']:+.0f})"
+    return f"{text}, which may be chance." if change["low"] <= 0 <= change["high"] else f"{text}."
+
+
+def _better_score(score: dict[str, float], here: str, there: str) -> str:
+    on = f"On the same {score['attempts']} attempts, which neither has learned from"
+    ends = sorted(abs(score[end]) for end in ("low", "high"))
+    if score["low"] <= 0 <= score["high"]:
+        return f"{on}, their Brier scores differ by no more than chance may make them."
+    better, worse = (there, here) if score["difference"] < 0 else (here, there)
+    lower = f"{abs(score['difference']):.3f} ({ends[0]:.3f} to {ends[1]:.3f})"
+    return f"{on}, {better} foresees what happens better than {worse}: its Brier score is {lower} lower."
 
 
 def _time(seconds: dict[str, float]) -> str:

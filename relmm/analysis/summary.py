@@ -59,6 +59,10 @@ def summarize_collection(collection: Collection, repo_id: str) -> dict[str, Any]
         "findings": quality.findings(frames, grasps, collection.runs, collection.root, repo_id),
         "next": performance.next_attempts(grid, _spread(collection)),
         "not_shown": notes + _missing(collection),
+        # Of what this is a summary, which the caller may know.
+        "where": None,
+        "policy_path": None,
+        "comparison": None,
     }
 
 

@@ -11,14 +11,18 @@ from typing import Any
 
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from matplotlib.figure import Figure
 
-from relmm.analysis import Collection, collect, export, summarize_collection, write_report
+from relmm.analysis import Collection, collect, compare, export, summarize_collection, write_report
+from relmm.analysis.comparison import on_common_ground, score_difference
 from relmm.analysis.predictions import Predictor
 from relmm.analysis.selection import narrowed
+from relmm.analysis.summary import SUMMARY
 from relmm.commands.cli import progress, run
 from relmm.commands.policies import load_config, make_actor, policy_from_path
 from relmm.episodes import check_repo_id, local_root
-from relmm.episodes.folder import RELMM, DatasetFolder
+from relmm.episodes.folder import OWN_DATASET, RELMM, DatasetFolder
 from relmm.episodes.info import runs_of
 from relmm.errors import ConfigError
 from relmm.learning.checkpoint import read_training_state, training_state
@@ -43,9 +47,12 @@ class AnalyzeDatasetConfig:
 
     @property
     def name(self) -> str:
-        """For commands that ask for a name."""
-        assert self.given
-        return (self.repo_id or f"local/{Path(str(self.root)).resolve().name}").partition("@")[0]
+        """For people, and commands that ask for a name; that of the run where relmm-train chose the folder's."""
+        if self.repo_id is not None:
+            return self.repo_id.partition("@")[0]
+        assert self.root is not None
+        root = self.root.resolve()
+        return f"local/{root.parent.name if root.name == OWN_DATASET else root.name}"
 
     def folder(self) -> Path:
         """Where it is, after a download if need be."""
@@ -148,7 +155,7 @@ def analyze(config: AnalyzeConfig) -> None:
     if config.where is not None:
         collection = narrowed(collection, config.where)
     summary = _summary(collection, config)
-    write_report(config.output_dir, collection, summary, _other(config, root))
+    write_report(config.output_dir, collection, summary, _comparison(collection, config, root))
     print(f"report: {config.output_dir / 'report.html'}")
     if config.export.root is not None:
         _export(config, collection, root)
@@ -174,7 +181,6 @@ def _summary(collection: Collection, config: AnalyzeConfig) -> dict[str, Any]:
         **summarize_collection(collection, config.dataset.name),
         "where": config.where,
         "policy_path": path,
-        "comparison": None,
     }
 
 
@@ -193,31 +199,57 @@ def learned_episodes(model: Path, root: Path) -> int | None:
         return None
     stored = read_training_state(model.parent)
     own, theirs = runs_of(DatasetFolder(root).read_json(RELMM)), runs_of(stored)
-    beside = model.resolve().parents[2] / "dataset" == root.resolve()
+    beside = model.resolve().parents[2] / OWN_DATASET == root.resolve()
     if not beside and not (own and theirs):
         return None
     return int(stored["counters"]["episodes"]) if beside or own[: len(theirs)] == theirs else 0
 
 
-def _other(config: AnalyzeConfig, root: Path) -> tuple[str, str, dict[str, Any]] | None:
+def _comparison(collection: Collection, config: AnalyzeConfig, root: Path) -> tuple[dict[str, Any], Figure] | None:
     compared, path = config.compare.dataset, config.compare.policy.path
     if not config.compare.given:
         return None
     assert config.output_dir is not None
     policy = config.policy if path is None else load_config(path, [])
     there = compared.folder() if compared.given else root
-    collection = _collect(there, config.output_dir / "compared", policy, "reading the other one")
+    other = _collect(there, config.output_dir / "compared", policy, "reading the other one")
     if config.where is not None:
-        collection = narrowed(collection, config.where)
-    name = compared.name if compared.given else config.dataset.name
-    summary = summarize_collection(collection, name)
-    (config.output_dir / "compared" / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
-    here = None if config.policy is None else str(config.policy.pretrained_path)
-    return _name(config.dataset.name, here), _name(name, path or here), summary
+        other = narrowed(other, config.where)
+    name, own = compared.name if compared.given else config.dataset.name, parser.get_path_arg("policy")
+    score = None
+    if there == root:
+        collection, other = on_common_ground(collection, other)
+        score = score_difference(collection, other)
+    here, beyond = summarize_collection(collection, config.dataset.name), summarize_collection(other, name)
+    names = told_apart((config.dataset.name, own), (name, path or own))
+    (config.output_dir / "compared" / SUMMARY).write_text(json.dumps(beyond, indent=2), encoding="utf-8")
+    return compare(here, beyond, (names[0], names[1]), score)
 
 
-def _name(dataset: str, policy: str | None) -> str:
-    return dataset if policy is None else f"{dataset}, {policy}"
+def told_apart(*compared: tuple[str, str | None]) -> list[str]:
+    """Short names of what is compared: the dataset if these differ, and the policy if those do.
+
+    Args:
+        compared: name of a dataset, and path of a policy or None.
+    """
+    datasets, policies = ([each[i] for each in compared] for i in (0, 1))
+    names = []
+    for dataset, policy in compared:
+        parts = [dataset] if len(set(datasets)) > 1 or len(set(policies)) == 1 else []
+        parts += [_short(policy)] if len(set(policies)) > 1 else []
+        names.append(", ".join(parts))
+    return names
+
+
+def _short(policy: str | None) -> str:
+    """A checkpoint of relmm-train by its run and step, whatever is on the Hub by its name."""
+    if policy is None:
+        return "as recorded"
+    path = Path(policy)
+    if path.name != PRETRAINED_MODEL_DIR or not path.is_dir():
+        return policy
+    step = path.resolve().parent
+    return f"{step.parents[1].name} at step {step.name.lstrip('0') or '0'}"
 
 
 def _export(config: AnalyzeConfig, collection: Collection, root: Path) -> None:

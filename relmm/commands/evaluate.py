@@ -6,7 +6,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,10 +20,14 @@ from numpy.typing import NDArray
 
 from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, dated_folder, progress, run
+from relmm.commands.display import DisplayOptions, live_views
 from relmm.commands.policies import check_camera, make_actor, policy_from_path, take_seed
+from relmm.display import LiveView
 from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
-from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES
+from relmm.features import ACTION_NAMES, FRONT, STATE_NAMES, FloatArray, Skill
+from relmm.geometry import moved
 from relmm.learning.actor import Actor
+from relmm.learning.life import motion_of
 from relmm.sim.config_relmm_room import RelmmRoomEnvConfig
 from relmm.sim.env import SUCCESS_SHARE, RelmmRoomEnv
 from relmm.sim.film import Film
@@ -57,7 +61,7 @@ class EvalSettings:
 
 
 @dataclass
-class EvalConfig:
+class EvalConfig(DisplayOptions):
     """Evaluate a policy in a simulated room.
 
     Args:
@@ -78,6 +82,7 @@ class EvalConfig:
         self.policy = policy_from_path(self.policy)
         if not isinstance(self.env, RelmmRoomEnvConfig):
             raise ConfigError(f"relmm-eval needs --env.type=relmm_room, not {self.env.type}.")
+        self.check_display()
         check_camera(self.policy, "env.camera", self.env)
         check_range("seed", self.seed, 0, MAX_SEED)
         if self.output_dir is None:
@@ -136,7 +141,12 @@ def evaluate(config: EvalConfig) -> None:
     actor = make_actor(config.policy)
     env = RelmmRoomEnv(**{**config.env.gym_kwargs, "render_mode": None})
     scores: list[EpisodeScore] = []
-    with StopOnSignal() as signals, closing(env), _bar(config) as bar:
+    with (
+        StopOnSignal() as signals,
+        closing(env),
+        live_views(config, "relmm-eval", config.env.camera, actor) as views,
+        _bar(config) as bar,
+    ):
 
         def show(info: dict[str, Any]) -> None:
             bar.set_description(f"episode {len(scores) + 1}/{config.eval.n_episodes}", refresh=False)
@@ -147,7 +157,7 @@ def evaluate(config: EvalConfig) -> None:
             for index in range(config.eval.n_episodes):
                 filmed = index < config.eval.n_videos
                 video = config.output_dir / "videos" / f"eval_episode_{index}.mp4" if filmed else None
-                scores.append(run_episode(env, actor, config.seed + index, video, lambda: signals.stopped, show))
+                scores.append(run_episode(env, actor, config.seed + index, video, lambda: signals.stopped, show, views))
                 _write(config.output_dir, scores)
     _say(config, scores)
     if signals.number is not None:
@@ -172,6 +182,7 @@ def run_episode(
     video: Path | None,
     should_stop: Callable[[], bool] = lambda: False,
     show: Callable[[dict[str, Any]], None] = lambda info: None,
+    views: Sequence[LiveView] = (),
 ) -> EpisodeScore:
     """One episode, filmed at four times its speed.
 
@@ -182,6 +193,7 @@ def run_episode(
         video: the film; None for none.
         should_stop: asked before each step.
         show: takes the room's `info` after each step.
+        views: show the robot.
 
     Raises:
         EpisodeStopped: it was told to stop; the film shows what there was.
@@ -190,14 +202,22 @@ def run_episode(
     actor.reset()
     film = Film(env.robot.body, video) if video is not None else None
     ended = False
+    pose: FloatArray = np.zeros(3)
+    for view in views:
+        view.begin_anew()
     with film or nullcontext():
         while not ended and not should_stop():
-            action = actor.act(_robot_observation(observation))
+            before = _robot_observation(observation)
+            action = actor.act(before)
             if film is not None:
                 film.caption, film.inset = _caption(info, actor.describe(action)), actor.picture()
             observation, _, terminated, truncated, info = env.step(np.array([action[n] for n in ACTION_NAMES]))
             ended = terminated or truncated
             show(info)
+            after = _robot_observation(observation)
+            for view in views:
+                view.show(before, action, actor.belief, pose, _picked_up(action, after))
+            pose = moved(pose, motion_of(after))
         if film is not None:
             film.caption = _caption(info, "the end" if ended else "stopped here")
     if not ended:
@@ -213,6 +233,11 @@ def run_episode(
         seconds=info["robot_seconds"],
         metres=info["metres_driven"],
     )
+
+
+def _picked_up(action: dict[str, float], after: dict[str, Any]) -> bool:
+    """Whether the robot believes that it did."""
+    return round(action["skill.pos"]) == Skill.GRASP and after["holding.pos"] > 0.5
 
 
 def _caption(info: dict[str, Any], doing: str) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from relmm.commands.arguments import Arguments
 from relmm.episodes import check_trainable, verify_and_repair
-from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, RELMM, STATS, TASKS
+from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, OWN_DATASET, RELMM, STATS, TASKS
 from relmm.episodes.hub import download_dataset
 from relmm.errors import ConfigError, DatasetError
 from relmm.learning.checkpoint import install_checkpoint, pretrained_model
@@ -81,10 +81,10 @@ def _copy_run(model: Path, dataset: Path, source: Source, run: Path) -> None:
     if (model / METRICS).is_file():
         shutil.copyfile(model / METRICS, run / METRICS)
     for file in (file for pattern in _DATASET_FILES for file in dataset.glob(pattern)):
-        target = run / "dataset" / file.relative_to(dataset)
+        target = run / OWN_DATASET / file.relative_to(dataset)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
-    _check_whole(run / "dataset", source)
+    _check_whole(run / OWN_DATASET, source)
 
 
 def _check_whole(root: Path, source: Source) -> None:

@@ -13,10 +13,12 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, now, progress, run
+from relmm.commands.display import DisplayOptions, live_views
 from relmm.commands.policies import FreshWeights, check_camera, make_actor, policy_from_path, take_seed
 from relmm.commands.robots import Pause, make_locobot
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
 from relmm.commands.upload import LICENSE
+from relmm.display import LiveView
 from relmm.episodes import (
     MAX_STEPS,
     EpisodeRecorder,
@@ -70,7 +72,7 @@ class RecordDatasetConfig:
 
 
 @dataclass
-class RecordConfig:
+class RecordConfig(DisplayOptions):
     """Record a robot's life as a LeRobot dataset.
 
     Args:
@@ -96,6 +98,7 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         self.policy = policy_from_path(self.policy)
+        self.check_display()
         check_camera(self.policy, "robot.camera", self.robot)
         if self.mode not in MODES:
             raise ConfigError(f"mode is {self.mode!r}, but must be one of {', '.join(MODES)}.")
@@ -131,8 +134,11 @@ def record(config: RecordConfig) -> None:
     robot = make_locobot(config.robot, seed, "relmm-record")
     with StopOnSignal() as signals, robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
-        with _recorder(config, root, robot) as recorder:
-            _collect(config, robot, actor, recorder, seed, signals)
+        with (
+            live_views(config, "relmm-record", robot.config.camera, actor) as views,
+            _recorder(config, root, robot) as recorder,
+        ):
+            _collect(config, robot, actor, recorder, views, seed, signals)
     if recorder.saved_episodes == 0:
         print(f"no episode was recorded; --resume=true goes on in {root}")
         return
@@ -163,10 +169,11 @@ def _collect(
     robot: LocobotRobot,
     actor: Actor,
     recorder: EpisodeRecorder,
+    views: list[LiveView],
     seed: int,
     signals: StopOnSignal,
 ) -> None:
-    collector = _collector(config, robot, actor, recorder, seed, lambda: signals.stopped)
+    collector = _collector(config, robot, actor, recorder, views, seed, lambda: signals.stopped)
     assert config.policy is not None
     fresh = FreshWeights(actor, config.policy.pretrained_path)
     frames = successes = grasps = 0
@@ -185,13 +192,14 @@ def _collector(
     robot: LocobotRobot,
     actor: Actor,
     recorder: EpisodeRecorder,
+    views: list[LiveView],
     seed: int,
     should_stop: Callable[[], bool],
 ) -> Collector | Cleaner:
     practice = config.mode == "practice"
     to_collect = None if practice else robot.body.room.num_objects if isinstance(robot, LocobotSim) else math.inf
     pause = Pause(robot, should_stop)
-    life = Life(robot, [recorder], robot.seconds, config.max_steps, pause, to_collect)
+    life = Life(robot, [recorder, *views], robot.seconds, config.max_steps, pause, to_collect)
     pause.charged = life.look_again
     if practice:
         return Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
@@ -200,6 +208,8 @@ def _collector(
     def set_up() -> None:
         if isinstance(robot, LocobotSim):  # else a person does it
             robot.reset(int(rooms.integers(2**31)))
+        for view in views:
+            view.begin_anew()
 
     return Cleaner(life, actor, set_up)
 

@@ -35,6 +35,9 @@ relmm-train: a robot is put into a room and learns to clean it.
   --dataset.push_to_hub=true    upload it
   --policy.push_to_hub=true     upload the checkpoint to --policy.repo_id=USER/NAME
   --hub.every=STEPS             upload while training, too
+  --wandb.enable=true           also log to Weights & Biases; --wandb.mode=offline without an account
+  --display_data=true           see what the robot sees and believes, in a viewer of rerun
+  --display_path=FILE.rrd       in a file for that viewer instead
 """,
     "relmm-eval": """\
 relmm-eval: how much of a room a policy cleans, with videos.
@@ -50,6 +53,8 @@ relmm-eval: how much of a room a policy cleans, with videos.
   --eval.n_episodes=10          of the seeds --seed, --seed + 1, ...
   --eval.n_videos=1             of them filmed
   --seed=1000                   of the first episode
+  --display_data=true           see what the robot sees and believes, in a viewer of rerun
+  --display_path=FILE.rrd       in a file for that viewer instead
   --output_dir=FOLDER           new; else outputs/eval/DATE/TIME_ROOM_POLICY
 """,
     "relmm-record": """\
@@ -70,6 +75,8 @@ relmm-record: record a robot's life as a LeRobot dataset.
   --pseudo_reset_steps=20       steps, at most, before and after an object is put down again
   --seed=0                      of everything random
   --resume=true                 go on with the dataset in its folder
+  --display_data=true           see what the robot sees and believes, in a viewer of rerun
+  --display_path=FILE.rrd       in a file for that viewer instead
 """,
     "relmm-analyze": """\
 relmm-analyze: what a robot did, where it grasps well, and whether its confidence can be trusted.

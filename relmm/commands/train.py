@@ -13,6 +13,7 @@ import numpy as np
 from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, now, run
 from relmm.commands.curve import draw_learning_curve
+from relmm.commands.display import live_views
 from relmm.commands.hub_resume import take_over_from_hub
 from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
@@ -58,8 +59,7 @@ def train(config: TrainConfig) -> None:
     draw_learning_curve(config.output_dir / "metrics.jsonl", config.output_dir / "learning_curve.png")
     kept = "checkpoints, metrics" if config.robot is None else "checkpoints, metrics, dataset"
     print(f"{kept} and learning_curve.png: {config.output_dir}")
-    run.uploads.say = print
-    run.uploads.finish()
+    run.finish()
 
 
 def _train_on_robot(run: Run) -> None:
@@ -71,13 +71,22 @@ def _train_on_robot(run: Run) -> None:
     robot = make_locobot(replace(config.robot), seed, "relmm-train")
     with robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
-        with _recorder(run, robot, seed) as recorder:
+        run.track()
+        with (
+            live_views(config, "relmm-train", robot.config.camera, run.actor, learning=True) as views,
+            _recorder(run, robot, seed) as recorder,
+        ):
+            run.listeners += [view.show_metrics for view in views]
             run.read_own_data()  # now that nobody else writes to it
             if damaged:
                 run.save(recorder.saved_episodes)
             pause = Pause(robot, lambda: run.signals.stopped)
             life = Life(
-                robot, [recorder, run.learner, run.progress], robot.seconds, config.max_steps, should_stop=pause
+                robot,
+                [recorder, run.learner, run.progress, *views],
+                robot.seconds,
+                config.max_steps,
+                should_stop=pause,
             )
             person = _person(robot, seed)
 
@@ -173,6 +182,7 @@ def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:
 def _train_on_stream(run: Run, root: Path) -> None:
     run.check_cursor(saved_episodes(root))
     run.read_initial_data()
+    run.track()
     follower = EpisodeFollower(root, run.read_own_data(), run.policy.config.camera)
 
     def episodes() -> Iterator[Episode]:

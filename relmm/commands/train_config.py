@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lerobot.configs.default import WandBConfig
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.arguments import said
 from relmm.commands.cli import dated_folder
+from relmm.commands.display import DisplayOptions
 from relmm.commands.policies import check_camera, policy_from_path
+from relmm.commands.tracking import check_tracking
 from relmm.commands.upload import LICENSE
 from relmm.episodes import MAX_STEPS, check_repo_id
+from relmm.episodes.folder import OWN_DATASET
 from relmm.errors import MANY, MAX_SEED, ConfigError, check_range, suggestion
 from relmm.learning.curriculum import CURRICULA
 from relmm.policies.learning import LearningConfig
@@ -106,7 +110,7 @@ class TrainEvalConfig:
 
 
 @dataclass
-class TrainConfig:
+class TrainConfig(DisplayOptions):
     """Train ReLMM online on a robot.
 
     Args:
@@ -116,6 +120,7 @@ class TrainConfig:
         curriculum: `--curriculum.type=stationary`, `autonomous` or `none`.
         eval: evaluation while training.
         hub: when to upload; what, is said with `--policy.push_to_hub`, `--policy.repo_id`, `--dataset.push_to_hub`.
+        wandb: also log to Weights & Biases, as lerobot-train does.
         steps: navigation steps to train for, those of earlier runs included.
         seed: of everything random; equal seeds give equal runs.
         output_dir: a folder that does not exist yet; None for outputs/train/DATE/TIME_JOB.
@@ -126,6 +131,7 @@ class TrainConfig:
         log_freq: navigation steps between lines of `metrics.jsonl`.
         max_steps: navigation steps after which an episode is cut off.
         pseudo_reset_steps: navigation steps, at most, before and after a picked-up object is put down again.
+        report: keep a `report.html` as relmm-analyze writes it in the output folder, refreshed in the background.
         replay_frames: newest attempts (relmm, 1.6 kB each), or attempts and navigation steps (relmm_paper, 30 kB and at
             most 60 kB), to learn from, kept in memory.
         num_threads: of torch; 1 is the fastest on few cores.
@@ -137,6 +143,7 @@ class TrainConfig:
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
     hub: HubConfig = field(default_factory=HubConfig)
+    wandb: WandBConfig = field(default_factory=WandBConfig)
     steps: int = 2000
     seed: int = 0
     output_dir: Path | None = None
@@ -147,6 +154,7 @@ class TrainConfig:
     log_freq: int = 50
     max_steps: int = 250
     pseudo_reset_steps: int = 20
+    report: bool = True
     replay_frames: int = 100_000
     num_threads: int = 1
 
@@ -173,6 +181,8 @@ class TrainConfig:
         if self.policy.seed is None:
             self.policy.seed = self.seed
         self._check_uploads()
+        self._check_display()
+        check_tracking(self.wandb)
         self._choose_folder()
 
     def _check_uploads(self) -> None:
@@ -191,6 +201,11 @@ class TrainConfig:
                 f"hub.every is {self.hub.every}, but nothing is uploaded: also say --policy.push_to_hub=true "
                 "--policy.repo_id=user/name, or --dataset.push_to_hub=true."
             )
+
+    def _check_display(self) -> None:
+        if self.display_data and self.robot is None:
+            raise ConfigError("There is no robot here to display: say --display_data=true to the one that records.")
+        self.check_display()
 
     def _choose_folder(self) -> None:
         if self.output_dir is None:
@@ -212,7 +227,7 @@ class TrainConfig:
     def dataset_root(self) -> Path:
         """The folder of the robot's life."""
         assert self.output_dir is not None
-        return self.dataset.root or self.output_dir / "dataset"
+        return self.dataset.root or self.output_dir / OWN_DATASET
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import draccus
 import numpy as np
 
+from relmm.analysis.report import REPORT
 from relmm.commands.cli import StopOnSignal, progress
+from relmm.commands.display import DisplayOptions
 from relmm.commands.policies import make_actor
 from relmm.commands.sharing import Uploads, run_arguments
+from relmm.commands.tracking import Tracker
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.training_bar import EVALUATION_WEIGHT, PRACTICE_WEIGHT, Phase, TrainingBar
+from relmm.commands.training_report import TrainingReport
 from relmm.episodes import (
     Episode,
     check_trainable,
@@ -52,7 +57,7 @@ class Run:
     def __init__(self, config: TrainConfig, signals: StopOnSignal) -> None:
         assert isinstance(config.policy, LearningConfig)
         self.config, self.signals = config, signals
-        self.saved_config = _settings_to_keep(config)
+        self.saved_config = settings_to_keep(config)
         self.checkpoint = last_checkpoint(config.checkpoints) if config.resume else None
         if self.checkpoint is not None:
             check_same_networks(self.checkpoint, config.policy.fingerprint())
@@ -70,7 +75,11 @@ class Run:
         if self.checkpoint is not None:
             counters = load_training_state(self.checkpoint, self.learner, self.rng)
             self.learned, self.progress.interventions = counters["episodes"], counters.get("interventions", 0)
+        self.listeners: list[Callable[[dict[str, Any]], None]] = []  # to the metrics
         assert config.output_dir is not None
+        self._tracker: Tracker | None = None
+        page = config.output_dir / REPORT
+        self._report = TrainingReport(self.data, config.dataset.repo_id, page) if config.report else None
         self.uploads = Uploads(run_arguments(config), config.output_dir)
 
     @property
@@ -124,7 +133,7 @@ class Run:
             episodes: of the run's dataset that the weights have learned from; a resumed run learns the later ones.
         """
         counters = {"episodes": episodes, "interventions": self.progress.interventions}
-        save_checkpoint(
+        checkpoint = save_checkpoint(
             self.config.checkpoints,
             self.progress.steps,
             self.actor,
@@ -134,6 +143,30 @@ class Run:
             self.saved_config,
             recorded_runs(DatasetFolder(self.data)),
         )
+        if self._tracker is not None:
+            self._tracker.log_checkpoint(checkpoint)
+        if self._report is not None and episodes:
+            self._report.refresh()
+
+    def track(self) -> None:
+        """Begin to log to Weights & Biases, if that is asked for; to be called when the run is sure to begin.
+
+        Raises:
+            ConfigError: it cannot be.
+        """
+        if self.config.wandb.enable:
+            self._tracker = Tracker(self.config, self.saved_config)
+            self.listeners.append(self._tracker.log)
+
+    def finish(self) -> None:
+        """Make the report of all there is, and send to others what they have not got yet."""
+        if self._report is not None and self.progress.attempts:
+            self._report.say = print
+            self._report.finish()
+        if self._tracker is not None:
+            self._tracker.finish()
+        self.uploads.say = print
+        self.uploads.finish()
 
     def bar(self, title: str) -> TrainingBar:
         """A progress bar of the whole run, what was done before a resume included."""
@@ -155,14 +188,18 @@ class Run:
         assert config.output_dir is not None
         schedule = Schedule(config.steps, config.log_freq, config.save_freq, config.env_eval_freq, config.hub.every)
         self.uploads.say = bar.write
+        if self._report is not None:
+            self._report.say = bar.write
 
         def show(status: dict[str, Any]) -> None:
             words = f"{status['objects']} objects, {status['successes']}/{status['attempts']} grasps"
             bar.advance("practice", status["practice_attempts"], words)
             bar.advance("steps", status["steps"], words)
             self.uploads.check()
+            if self._report is not None:
+                self._report.check()
 
-        metrics = Metrics(config.output_dir / "metrics.jsonl")
+        metrics = Metrics(config.output_dir / "metrics.jsonl", self.listeners)
         return Session(
             schedule,
             self.progress,
@@ -175,9 +212,11 @@ class Run:
         )
 
 
-def _settings_to_keep(config: TrainConfig) -> dict[str, Any]:
+def settings_to_keep(config: TrainConfig) -> dict[str, Any]:
     """For a resume, which may come from another folder: as given, but with whole paths."""
     settings: dict[str, Any] = draccus.encode(config)
+    for option in fields(DisplayOptions):  # who looks on today need not look on after a resume
+        del settings[option.name]
     dataset = settings["dataset"]
     for name in ("root", "follow", "init"):
         # What does not exist yet is a folder, too, but for `init`: that may be a name on the Hub.

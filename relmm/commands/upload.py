@@ -13,7 +13,7 @@ from relmm.commands.cli import run
 from relmm.commands.curve import draw_learning_curve
 from relmm.commands.model_card import ModelFacts, model_card
 from relmm.episodes import UploadedDataset, check_repo_id, upload_dataset
-from relmm.episodes.folder import DatasetFolder
+from relmm.episodes.folder import OWN_DATASET, DatasetFolder
 from relmm.episodes.upload import recorded_runs
 from relmm.errors import ConfigError
 from relmm.learning.checkpoint import last_checkpoint, pretrained_model
@@ -94,7 +94,7 @@ class UploadConfig:
         checkpoint = last_checkpoint(self.output_dir / "checkpoints", running=True)
         settings = read_settings(pretrained_model(checkpoint))["dataset"]
         root = settings["root"] or settings["follow"]
-        return Path(root) if root else self.output_dir / "dataset"
+        return Path(root) if root else self.output_dir / OWN_DATASET
 
 
 def upload(config: UploadConfig) -> None:

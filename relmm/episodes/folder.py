@@ -24,6 +24,7 @@ TASKS = "meta/tasks.parquet"
 RELMM = "meta/relmm.json"
 EPISODE_FILES = "meta/episodes/*/*.parquet"
 DATA_FILES = "data/*/*.parquet"
+OWN_DATASET = "dataset"  # name of the folder of a run's dataset, in that of the run
 
 
 def sync(path: Path) -> None:

@@ -133,7 +133,7 @@ class Life:
         odometry = (*self.pose[:2].tolist(), math.degrees(self.pose[2]))
         done_action = self._robot.send_action(action)
         self.observation = self._robot.get_observation()
-        self.pose = moved(self.pose, _motion(self.observation))
+        self.pose = moved(self.pose, motion_of(self.observation))
         self._count(done_action, phase)
         success = self.succeeded
         done = success if self._to_collect is None else self.episode.collected >= self._to_collect
@@ -182,7 +182,7 @@ class Life:
         self._grasps_since_drive = 0
 
 
-def _motion(observation: dict[str, Any]) -> FloatArray:
+def motion_of(observation: dict[str, Any]) -> FloatArray:
     """Forward, left (m) and turn (rad) of the last skill."""
     forward, left, turn = (observation[name] * DRIVE_PULSE_S for name in MOTION_NAMES)
     return np.array([forward, left, math.radians(turn)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -85,12 +86,14 @@ class Metrics:
 
     Args:
         path: of the file; appended to.
+        listeners: take each line, too, after it is on the disk.
 
     Attributes:
         seconds: of training that the file already tells of.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, listeners: Sequence[Callable[[dict[str, Any]], None]] = ()) -> None:
+        self._listeners = listeners
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("a", encoding="utf-8")
         self.seconds = max((line["seconds"] for line in read_metrics(path)), default=0.0)
@@ -104,6 +107,8 @@ class Metrics:
         self._file.write(json.dumps(rounded) + "\n")
         self._file.flush()
         os.fsync(self._file.fileno())
+        for listener in self._listeners:
+            listener(rounded)
 
     def close(self) -> None:
         """Close the file."""

@@ -63,6 +63,19 @@ def test_calibrated_robot_is_not_accused_and_an_overconfident_one_is():
     assert low < 0.2 < high
 
 
+def test_interval_is_that_of_robots_with_attempts_drawn_again():
+    """Against the table of each draw; 207 attempts do not fill ten bins equally."""
+    rng = np.random.default_rng(5)
+    chances = np.sort(rng.random(207))
+    outcomes = rng.random(207) < chances**2
+    draws = np.random.default_rng(0)
+    errors = []
+    for _ in range(1000):
+        draw = draws.integers(207, size=207)
+        errors.append(statistics.reliability(chances[draw], outcomes[draw]).ece)
+    assert statistics.ece_interval(chances, outcomes) == pytest.approx(tuple(np.quantile(errors, [0.025, 0.975])))
+
+
 def test_bound_holds_for_about_95_of_100_calibrated_robots():
     rng = np.random.default_rng(3)
     chances = rng.random(200)

@@ -111,4 +111,5 @@ def tiny() -> list[str]:
         "--env_eval_freq=0",
         "--log_freq=2",
         "--save_freq=4",
+        "--report=false",
     ]

@@ -4,9 +4,12 @@ import importlib.util
 import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from relmm.analysis import Collection
+from relmm.analysis.comparison import on_common_ground, score_difference
 from relmm.commands import analyze as command
 from relmm.commands.analyze import (
     AnalyzeConfig,
@@ -15,6 +18,7 @@ from relmm.commands.analyze import (
     ComparedPolicyConfig,
     ExportConfig,
     learned_episodes,
+    told_apart,
 )
 from relmm.commands.policies import load_config, make_actor
 from relmm.errors import ConfigError, DatasetError
@@ -118,6 +122,35 @@ def test_two_datasets_and_two_policies_side_by_side(root, model, tmp_path):
     assert "Side by side" in (tmp_path / "report" / "report.html").read_text()
 
 
+def test_two_policies_are_judged_by_the_attempts_that_neither_has_learned_from(made_collections):
+    """One says 0.5 of everything; the other 0.9 where it succeeds and 0.2 where it fails, of which it learned half."""
+    here, there = on_common_ground(*made_collections)
+    assert here.grasps["index"].tolist() == there.grasps["index"].tolist() == list(range(50, 90))
+    score = score_difference(here, there)
+    gains = np.where(here.grasps["success"], 0.1**2, 0.2**2) - 0.25
+    assert score["attempts"] == 40
+    assert score["difference"] == pytest.approx(gains.mean())
+    half = 1.959964 * gains.std(ddof=1) / 40**0.5
+    assert (score["low"], score["high"]) == pytest.approx((gains.mean() - half, gains.mean() + half))
+
+
+@pytest.fixture
+def made_collections():
+    rng = np.random.default_rng(0)
+    rows = pd.DataFrame({"index": np.arange(100), "success": rng.random(100) < 0.4})
+    here = rows.iloc[:90].assign(policy_mean=0.5, learned_from=pd.Series(rows["index"] < 20).astype("boolean"))
+    there = rows.assign(policy_mean=np.where(rows["success"], 0.9, 0.2), learned_from=rows["index"] < 50)
+    return [Collection(Path("made"), rows, grasps, [], []) for grasps in (here, there)]
+
+
+def test_a_comparison_of_policies_says_nothing_of_success(root, model, tmp_path):
+    compare = CompareConfig(policy=ComparedPolicyConfig(path=str(model)))
+    both = analyze(root, tmp_path / "report", compare=compare)["comparison"]
+    assert both["success"] is None
+    assert [row["attempts"] for row in both["rows"]] == [30, 30]  # of episodes 3 to 5
+    assert both["score"]["attempts"] == 30
+
+
 @pytest.mark.parametrize(
     ("more", "words"),
     [
@@ -149,3 +182,14 @@ def test_mistakes_end_in_a_sentence(run):
         assert done.returncode == 2
         assert words in done.stderr
         assert "Traceback" not in done.stderr
+
+
+def test_what_is_compared_has_short_names_that_tell_it_apart(model, tmp_path):
+    """A dataset that relmm-train has put into its run's folder is called after the run."""
+    assert AnalyzeDatasetConfig(root=tmp_path / "first" / "dataset").name == "local/first"
+    assert AnalyzeDatasetConfig(root=tmp_path / "room").name == "local/room"
+    checkpoint = f"{model.parents[2].name} at step 10"
+    assert told_apart(("local/first", str(model)), ("local/second", str(model))) == ["local/first", "local/second"]
+    assert told_apart(("local/first", None), ("local/first", str(model))) == ["as recorded", checkpoint]
+    both = told_apart(("local/first", "me/cleaner@main"), ("local/second", str(model)))
+    assert both == ["local/first, me/cleaner@main", f"local/second, {checkpoint}"]

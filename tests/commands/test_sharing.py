@@ -30,7 +30,7 @@ SHARED = (
     "--dataset.repo_id=me/life",
 )
 ONLINE = {"HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
-SAMPLE = Path(__file__).parents[2] / "datasets" / "diverse_scripted"
+SAMPLE = Path(__file__).parents[2] / "datasets" / "first_attempts"
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def published_run(hub, tmp_path) -> None:
     actor = make_actor(ReLMMConfig(device="cpu", num_members=2, channels=4))
     learner = actor.policy.make_learner(seed=0, capacity=1000)
     settings = {"policy": {"type": "relmm"}, "dataset": {"repo_id": "me/life"}}
-    counters = {"episodes": 10, "interventions": 0}
+    counters = {"episodes": 70, "interventions": 0}
     saved = save_checkpoint(tmp_path / "saved", 7, actor, learner, np.random.default_rng(0), counters, settings, [])
     runs = recorded_runs(DatasetFolder(SAMPLE))
     upload_checkpoint(saved, "me/policy", private=None, dataset=dataset, runs=runs, decorate=lambda folder: None)
@@ -206,7 +206,7 @@ def test_a_disk_that_is_full_while_a_run_is_taken_over(hub, call, tmp_path):
     assert not out.exists()
     command_line = Arguments(arguments)
     take_over_from_hub(command_line)
-    assert summarize(out / "dataset").episodes == 10, "a later attempt completes"
+    assert summarize(out / "dataset").episodes == 70, "a later attempt completes"
     assert command_line.words == ["--resume=true", f"--output_dir={out}"], "the rest resumes a local run"
 
 
@@ -251,7 +251,7 @@ def test_the_last_upload(hub, fault, background):
     hub.faults.clear()
     uploads.finish()
     assert said[0] == "Uploading to the Hub; Ctrl-C leaves it for later."
-    assert said[-1].startswith("dataset, 10 episodes: http://127.0.0.1")
+    assert said[-1].startswith("dataset, 70 episodes: http://127.0.0.1")
 
 
 @pytest.mark.slow
@@ -268,14 +268,14 @@ def test_the_last_upload_takes_the_place_of_one_under_way(hub, fault, background
     started = time.monotonic()
     uploads.finish()
     assert time.monotonic() - started < 50
-    assert said[-1].startswith("dataset, 10 episodes: ")
+    assert said[-1].startswith("dataset, 70 episodes: ")
     assert not list((tmp_path / "copies").glob("relmm-upload-*")), "also the copy of the one that was ended"
 
 
 def test_upload_again_by_hand(hub, call):
     status, printed, errors = call(upload.main, "--dataset.repo_id=me/room", f"--dataset.root={SAMPLE}")
     assert status == 0, errors
-    assert "dataset, 10 episodes" in printed
+    assert "dataset, 70 episodes" in printed
     for arguments, words in (
         ([], "Say what to upload"),
         (["--dataset.repo_id=me/room"], "--output_dir=FOLDER of a run"),

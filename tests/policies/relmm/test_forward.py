@@ -20,7 +20,7 @@ from relmm.features import ACTION_NAMES, IMAGE_KEY, STATE_KEY, STATE_NAMES, Phas
 from relmm.policies.controller import grasp_cell
 from relmm.policies.relmm.modeling_relmm import ReLMMPolicy
 
-RECORDED = Path(__file__).parents[3] / "datasets" / "diverse_scripted"
+RECORDED = Path(__file__).parents[3] / "datasets" / "first_attempts"
 STATE = np.zeros(len(STATE_NAMES), np.float32)
 SKILLS = {"d": Skill.NAVIGATE, "f": Skill.GRASP, "s": Skill.GRASP, "p": Skill.PLACE}
 MakePolicy = Callable[..., ReLMMPolicy]

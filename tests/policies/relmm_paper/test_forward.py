@@ -21,7 +21,7 @@ from relmm.policies.relmm_paper.modeling_relmm_paper import RelmmPaperPolicy
 from relmm.policies.relmm_paper.navigation import NavigationBatch
 from relmm.policies.relmm_paper.replay import to_pictures
 
-RECORDED = Path(__file__).parents[3] / "datasets" / "diverse_scripted"
+RECORDED = Path(__file__).parents[3] / "datasets" / "first_attempts"
 STATE = np.zeros(len(STATE_NAMES), np.float32)
 CPU = torch.device("cpu")
 MakePolicy = Callable[..., RelmmPaperPolicy]
