@@ -12,7 +12,7 @@ from relmm.errors import ConfigError, DatasetError
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
-SAMPLE = ROOT / "datasets" / "diverse_scripted"
+SAMPLE = ROOT / "datasets" / "first_attempts"
 
 
 @pytest.fixture(scope="module")

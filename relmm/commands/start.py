@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from relmm.commands.arguments import said
-from relmm.commands.terminal import say_loading
+from relmm.commands.terminal import lasting, say_loading
 
 SHORT_HELP = {
     "relmm-train": """\
@@ -153,7 +153,8 @@ def calibrate() -> None:
 
 def _start(command: str, module: str) -> None:
     if said().asks_for_help:
-        print(f"{SHORT_HELP[command]}\n{command} --help_all lists every option.")
+        with lasting():
+            print(f"{SHORT_HELP[command]}\n{command} --help_all lists every option.")
         return
     say_loading(command)
     import_module(f"relmm.commands.{module}").main()

@@ -62,3 +62,15 @@ def test_help_names_defaults_that_hold(config, command):
             field = {field.name: field for field in fields(default)}[name]
             default = field.default if field.default is not MISSING else field.default_factory()
         assert default == int(value), option
+
+
+def test_help_in_a_pipe_that_is_closed_early():
+    done = subprocess.run(
+        f"{sys.executable} -c 'from relmm.commands.start import train; train()' --help | true; exit ${{PIPESTATUS[0]}}",
+        shell=True,
+        executable="/bin/bash",
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
