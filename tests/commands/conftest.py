@@ -16,7 +16,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture(scope="session")
-def _server() -> Iterator[Callable[[dict[str, Any]], int]]:
+def _scripts() -> Iterator[Callable[[dict[str, Any]], int]]:
     """Runs a console script and returns its exit status; see `command_server.py`."""
     processes: list[subprocess.Popen[bytes]] = []
 
@@ -37,7 +37,7 @@ def _server() -> Iterator[Callable[[dict[str, Any]], int]]:
 
 
 @pytest.fixture(scope="session")
-def run_in(_server, tmp_path_factory) -> Run:
+def run_in(_scripts, tmp_path_factory) -> Run:
     """Run a console script of this environment in a folder."""
 
     def call(folder: Path, command: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -51,7 +51,7 @@ def run_in(_server, tmp_path_factory) -> Run:
             "stderr": str(output / "stderr"),
             "seconds": _PATIENCE_S,
         }
-        status = _server(request)
+        status = _scripts(request)
         said, errors = ((output / name).read_text() for name in ("stdout", "stderr"))
         return subprocess.CompletedProcess([command, *arguments], status, said, errors)
 
