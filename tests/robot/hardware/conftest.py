@@ -72,7 +72,7 @@ def emulate(tmp_path: Path) -> Iterator[Callable[..., Emulated]]:
     """Start an emulated LoCoBot; it ends with the test."""
     running = []
 
-    def start(room: str = "no_obstacles", num_objects: int = 20, seed: int = 0, speed: float = 1.0) -> Emulated:
+    def start(room: str = "no_obstacles", num_objects: int = 20, seed: int = 0, speed: float = 0.0) -> Emulated:
         folder = tmp_path / f"locobot_{len(running)}"
         folder.mkdir()
         command = [sys.executable, str(HERE / "emulated_locobot.py"), str(folder), room]
@@ -89,7 +89,7 @@ def emulate(tmp_path: Path) -> Iterator[Callable[..., Emulated]]:
             **os.environ,
             "PYTHONPATH": path,
             "RELMM_FAKE_REALSENSE": str(folder / "camera"),
-            "RELMM_FAKE_REALSENSE_FPS": "6",
+            "RELMM_FAKE_REALSENSE_FPS": "10",
         }
         return Emulated(folder, environment, process)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import queue
+import struct
 import sys
 import threading
 import time
@@ -32,7 +33,7 @@ from pyrealsense2 import INTRINSICS
 
 PERIOD_S = 0.02
 WHEEL_RADIUS = 0.035
-_STILL_S, _PATIENCE_S = 0.004, 0.1
+_PATIENCE_S = 5.0
 ARM_IDS = (1, 2, 4, 5, 6)
 
 
@@ -64,6 +65,7 @@ class EmulatedLocobot:
         self._heading = self.body.truth.robot()[2]
         self._turned = 0.0
         self._gripper_pwm = 0
+        self._driven = False  # whether a command came in the last period
         self._lies = self.body.state().joints
         self.person: queue.SimpleQueue[tuple[float, float]] = queue.SimpleQueue()
         self.time = SharedTime(folder / "time")
@@ -89,18 +91,15 @@ class EmulatedLocobot:
         due = time.monotonic()
         while not stopped.is_set():
             self._let_person_act()
+            self._show_pictures()
             if self.speed:
                 self._tick()
-                self._show_pictures()
                 due = max(due + PERIOD_S / self.speed, time.monotonic() - 0.2)
                 time.sleep(max(due - time.monotonic(), 0.0))
             elif self.time.now() + 1e-9 < self.time.allowed():
                 self._tick()
-                due = time.monotonic()
             else:
                 time.sleep(0.0002)
-                if time.monotonic() > due + _STILL_S:  # the program is at work: perhaps it waits for a picture
-                    self._show_pictures()
 
     def _tick(self) -> None:
         self.time.advance(PERIOD_S)
@@ -110,11 +109,12 @@ class EmulatedLocobot:
             self._wait_for_command(heard)
 
     def _wait_for_command(self, heard: int) -> None:
-        """A real driver answers long before the next 20 ms are over; this one may be kept waiting by the machine."""
-        until = time.monotonic() + _PATIENCE_S
+        """A driver answers long before the next 20 ms are over. This one may be kept waiting by the machine."""
+        until = time.monotonic() + (_PATIENCE_S if self._driven else 0.0)
         while len(self.base.commands) == heard and time.monotonic() < until:
             time.sleep(0.0002)
             self.base.receive()
+        self._driven = len(self.base.commands) > heard
 
     # --- What the base moves -----------------------------------------------------------------------------
     def step(self, seconds: float, x_vel: float, theta_vel: float) -> None:
@@ -180,9 +180,11 @@ class EmulatedLocobot:
         if self._wanted.empty():
             return
         rgb, depth = self.body.capture()
+        taken = struct.pack("d", self.time.now())
         while not self._wanted.empty():
             connection = self._wanted.get()
             try:
+                connection.send_bytes(taken)
                 connection.send_bytes(rgb.tobytes())
                 connection.send_bytes(depth.tobytes())
             except OSError:

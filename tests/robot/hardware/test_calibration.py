@@ -93,7 +93,7 @@ def test_damaged_calibration_is_one_sentence(tmp_path, change, words):
 def test_command_measures_camera_gripper_and_sag(emulate):
     pytest.importorskip("serial", reason="pyserial is not installed (the extra `hardware`)")
     pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
-    emulated = emulate(num_objects=1, speed=0.0)
+    emulated = emulate(num_objects=1)
     here = Path(__file__).parent
     command = [sys.executable, str(here / "locobot_command.py"), str(emulated.folder), "relmm.commands.calibrate"]
     done = subprocess.run(

@@ -14,12 +14,9 @@ pytest.importorskip("serial", reason="pyserial is not installed (the extra `hard
 pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
 pytestmark = pytest.mark.slow  # real protocols in real time, which a busy machine upsets
 
-from dynamixel_sdk import port_handler
-from emulated_time import SharedTime
-from locobot_command import PATIENCE_MS
+from emulated_time import SharedTime, live_in
 
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
-from relmm.robot.hardware import clock
 from relmm.robot.hardware.config_locobot import LocobotConfig
 from relmm.robot.hardware.locobot import Locobot
 
@@ -28,14 +25,10 @@ HERE = Path(__file__).parent
 
 @pytest.fixture
 def robot(emulate, realsense, monkeypatch, request):
-    emulated = emulate(**getattr(request, "param", {}), speed=0.0)
-    shared = SharedTime(emulated.folder / "time")
-    monkeypatch.setattr(clock, "now", shared.now)
-    monkeypatch.setattr(clock, "sleep", shared.sleep)
-    monkeypatch.setattr(port_handler, "LATENCY_TIMER", PATIENCE_MS)
-    for name in ("RELMM_FAKE_REALSENSE", "RELMM_FAKE_REALSENSE_FPS"):
-        monkeypatch.setenv(name, emulated.environment[name])
-    monkeypatch.setattr(realsense, "fps", 15.0)
+    emulated = emulate(**getattr(request, "param", {}))
+    live_in(SharedTime(emulated.folder / "time"), monkeypatch.setattr)
+    monkeypatch.setenv("RELMM_FAKE_REALSENSE", emulated.environment["RELMM_FAKE_REALSENSE"])
+    monkeypatch.setattr(realsense, "fps", 10.0)
     robot = Locobot(
         LocobotConfig(
             base_port=str(emulated.folder / "kobuki"),
@@ -65,7 +58,7 @@ def run_command(emulated, module: str, *arguments: str) -> subprocess.CompletedP
     command = [sys.executable, str(HERE / "locobot_command.py"), str(emulated.folder), module]
     return subprocess.run(
         [*command, *emulated.options, *arguments],
-        env={**emulated.environment, "PYTHONPATH": path, "RELMM_FAKE_REALSENSE_FPS": "15"},
+        env={**emulated.environment, "PYTHONPATH": path},
         capture_output=True,
         text=True,
         timeout=550,
