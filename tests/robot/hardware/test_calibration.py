@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,16 +90,7 @@ def test_command_measures_camera_gripper_and_sag(emulate):
     pytest.importorskip("serial", reason="pyserial is not installed (the extra `hardware`)")
     pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
     emulated = emulate(num_objects=1)
-    here = Path(__file__).parent
-    command = [sys.executable, str(here / "locobot_command.py"), str(emulated.folder), "relmm.commands.calibrate"]
-    done = subprocess.run(
-        [*command, *emulated.options, "--robot.id=me", "--steps=[camera,gripper,arm]"],
-        input="\n\n\n",
-        env={**emulated.environment, "PYTHONPATH": emulated.environment["PYTHONPATH"] + os.pathsep + str(here)},
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
+    done = emulated.run("relmm.commands.calibrate", "--robot.id=me", "--steps=[camera,gripper,arm]", said="\n\n\n")
     assert done.returncode == 0, done.stderr
     measured = load_calibration(emulated.folder / "calibration" / "me.json")
     assert measured.camera_height == pytest.approx(CAMERAS["d435"].position[2], abs=0.004)

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -19,8 +15,6 @@ from emulated_time import SharedTime, live_in
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
 from relmm.robot.hardware.config_locobot import LocobotConfig
 from relmm.robot.hardware.locobot import Locobot
-
-HERE = Path(__file__).parent
 
 
 @pytest.fixture
@@ -53,26 +47,12 @@ def test_robot_drives_and_turns_as_told(robot):
     assert robot.get_observation()["theta.vel"] == pytest.approx(MAX_THETA_VEL, abs=30)
 
 
-def run_command(emulated, module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    path = f"{emulated.environment['PYTHONPATH']}{os.pathsep}{HERE}"
-    command = [sys.executable, str(HERE / "locobot_command.py"), str(emulated.folder), module]
-    return subprocess.run(
-        [*command, *emulated.options, *arguments],
-        env={**emulated.environment, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=550,
-        stdin=subprocess.DEVNULL,
-    )
-
-
-@pytest.mark.slow
 def test_scripted_policy_picks_things_up(emulate, tmp_path):
     """Through the bytes, by the robot's own judgement, which the simulator confirms elsewhere."""
     options = ["--policy.type=relmm_scripted", "--policy.camera=d435", "--dataset.repo_id=me/x"]
     limits = ["--dataset.num_episodes=2", "--max_steps=40", "--pseudo_reset_steps=2"]
     root = tmp_path / "x"
-    done = run_command(emulate(), "relmm.commands.record", *options, *limits, f"--dataset.root={root}")
+    done = emulate().run("relmm.commands.record", *options, *limits, f"--dataset.root={root}")
     assert done.returncode == 0, done.stderr
     assert "robot_type" in (root / "meta" / "info.json").read_text()
     episodes, success = re.search(r"episodes +(\d+) \((\d+) by success", done.stdout).groups()
@@ -80,13 +60,12 @@ def test_scripted_policy_picks_things_up(emulate, tmp_path):
     assert int(success) >= 1
 
 
-@pytest.mark.slow
 def test_training_learns_from_it_and_goes_on(emulate, tmp_path):
     folder = tmp_path / "run"
     options = ["--policy.camera=d435", "--policy.num_stationary=1", "--curriculum.type=none", "--env_eval_freq=0"]
     options += ["--policy.min_attempts_to_update=2", "--policy.batch_size=8", f"--output_dir={folder}", "--save_freq=2"]
-    done = run_command(emulate(), "relmm.commands.train", *options, "--steps=4")
+    done = emulate().run("relmm.commands.train", *options, "--steps=4")
     assert done.returncode == 0, done.stderr
-    done = run_command(emulate(), "relmm.commands.train", *options, "--steps=6", "--resume=true")
+    done = emulate().run("relmm.commands.train", *options, "--steps=6", "--resume=true")
     assert done.returncode == 0, done.stderr
     assert (folder / "checkpoints" / "000006").is_dir()
