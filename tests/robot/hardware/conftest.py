@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -47,6 +48,30 @@ def emulate(tmp_path: Path) -> Iterator[Callable[..., Emulated]]:
     with ExitStack() as running:
         numbers = count()
         yield lambda **settings: running.enter_context(Emulated(tmp_path / f"locobot_{next(numbers)}", **settings))
+
+
+@pytest.fixture
+def live_in_emulator(realsense: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Emulated], Any]]:
+    """Connect to an emulated LoCoBot in this process, and live in its time until the test ends."""
+    from emulated_time import SharedTime, live_in
+
+    from relmm.robot.hardware.config_locobot import LocobotConfig
+    from relmm.robot.hardware.locobot import Locobot
+
+    with ExitStack() as connections:
+
+        def connect(emulated: Emulated) -> Locobot:
+            live_in(SharedTime(emulated.folder / "time"), monkeypatch.setattr)
+            monkeypatch.setenv("RELMM_FAKE_REALSENSE", emulated.environment["RELMM_FAKE_REALSENSE"])
+            monkeypatch.setattr(realsense, "fps", 10.0)
+            config = LocobotConfig(
+                base_port=str(emulated.folder / "kobuki"),
+                arm_port=str(emulated.folder / "dxl"),
+                calibration_dir=emulated.folder / "calibration",
+            )
+            return connections.enter_context(Locobot(config))
+
+        yield connect
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -22,6 +23,7 @@ class Emulated:
         num_objects: in the room.
         seed: of the room.
         speed: of its time against ours; 0 to let it pass only while the driving program sleeps.
+        faults: how it differs from the drawing, see `emulated_locobot.Faults`.
 
     Attributes:
         folder: as given.
@@ -30,12 +32,18 @@ class Emulated:
     """
 
     def __init__(
-        self, folder: Path, room: str = "no_obstacles", num_objects: int = 20, seed: int = 0, speed: float = 0.0
+        self,
+        folder: Path,
+        room: str = "no_obstacles",
+        num_objects: int = 20,
+        seed: int = 0,
+        speed: float = 0.0,
+        **faults: float,
     ) -> None:
         folder.mkdir(parents=True)
         self.folder = folder
         words = [sys.executable, str(HERE / "emulated_locobot.py"), str(folder), room]
-        words += [str(num_objects), str(seed), str(speed)]
+        words += [str(num_objects), str(seed), str(speed), json.dumps(faults)]
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._expect("ready")
         self.options = [
@@ -51,12 +59,12 @@ class Emulated:
             "RELMM_FAKE_REALSENSE_FPS": _FPS,
         }
 
-    def put(self, x: float, y: float) -> None:
-        """Lay the first object down as a person would; m, robot frame."""
+    def order(self, what: str, *numbers: float) -> list[float]:
+        """Let a person do something, see `emulated_locobot.Person`; what they see."""
         assert self._process.stdin is not None
-        self._process.stdin.write(f"put {x} {y}\n")
+        self._process.stdin.write(f"{what} {' '.join(map(str, numbers))}\n")
         self._process.stdin.flush()
-        self._expect("put")
+        return self._expect("done")
 
     def command(self, module: str, *arguments: str) -> list[str]:
         """The words of a command of relmm or LeRobot that drives it, in its time."""
@@ -79,10 +87,11 @@ class Emulated:
             timeout=timeout,
         )
 
-    def _expect(self, word: str) -> None:
+    def _expect(self, word: str) -> list[float]:
         assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        assert line == f"{word}\n", f"the emulated LoCoBot says {line!r}"
+        said, *numbers = self._process.stdout.readline().split() or [""]
+        assert said == word, f"the emulated LoCoBot says {said!r}"
+        return [float(number) for number in numbers]
 
     def close(self) -> None:
         """End it."""

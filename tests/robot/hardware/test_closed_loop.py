@@ -10,29 +10,12 @@ pytest.importorskip("serial", reason="pyserial is not installed (the extra `hard
 pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
 pytestmark = pytest.mark.slow  # real protocols in real time, which a busy machine upsets
 
-from emulated_time import SharedTime, live_in
-
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
-from relmm.robot.hardware.config_locobot import LocobotConfig
-from relmm.robot.hardware.locobot import Locobot
 
 
 @pytest.fixture
-def robot(emulate, realsense, monkeypatch, request):
-    emulated = emulate(**getattr(request, "param", {}))
-    live_in(SharedTime(emulated.folder / "time"), monkeypatch.setattr)
-    monkeypatch.setenv("RELMM_FAKE_REALSENSE", emulated.environment["RELMM_FAKE_REALSENSE"])
-    monkeypatch.setattr(realsense, "fps", 10.0)
-    robot = Locobot(
-        LocobotConfig(
-            base_port=str(emulated.folder / "kobuki"),
-            arm_port=str(emulated.folder / "dxl"),
-            calibration_dir=emulated.folder / "calibration",
-        )
-    )
-    robot.connect()
-    yield robot
-    robot.disconnect()
+def robot(emulate, live_in_emulator):
+    return live_in_emulator(emulate())
 
 
 def test_robot_drives_and_turns_as_told(robot):
