@@ -249,6 +249,11 @@ class Person:
         x, y, _ = arm_forward(self._body.state().joints)[3]
         return float(x), float(y)
 
+    def stands(self) -> tuple[float, float, float]:
+        """Look where the robot stands in the room: x, y and its heading in rad."""
+        x, y, heading = self._body.truth.robot()
+        return float(x), float(y), float(heading)
+
     def carry(self, x: float, y: float, degrees: float) -> None:
         """Carry the robot to a place of the room, heading there."""
         half = math.radians(degrees) / 2
