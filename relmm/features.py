@@ -29,6 +29,7 @@ class Phase(IntEnum):
     LEARNING = 1
     PSEUDO_RESET = 2
     EVALUATION = 3
+    TELEOPERATION = 4
 
 
 # What a robot is told to do (`task`): in evaluations and `--mode=clean`, and while it practises.

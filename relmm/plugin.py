@@ -8,4 +8,5 @@ import relmm.policies.scripted.configuration_scripted
 import relmm.robot.hardware.config_locobot
 import relmm.sim.config_locobot_sim
 import relmm.sim.config_relmm_room
+import relmm.teleoperator.config_locobot_keyboard
 import relmm.teleoperator.config_locobot_scripted  # noqa: F401

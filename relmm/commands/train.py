@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,6 +20,7 @@ from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
 from relmm.commands.robots import Pause, make_locobot
 from relmm.commands.sharing import check_uploads
+from relmm.commands.take_over import TakeOver
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
 from relmm.commands.training_bar import TrainingBar
@@ -38,6 +40,7 @@ from relmm.robot.locobot import LocobotRobot
 from relmm.sim.config_locobot_sim import LocobotSimConfig
 from relmm.sim.locobot_sim import LocobotSim
 from relmm.sim.person import Person
+from relmm.teleoperator.locobot_keyboard import TAKE_OVER, LocobotKeyboard
 
 _PERSON_STREAM = 4  # keeps random numbers of one seed apart
 _POLL_S = 0.5  # between looks at a dataset that is followed
@@ -69,7 +72,7 @@ def _train_on_robot(run: Run) -> None:
     run.read_initial_data()
     seed = config.seed + saved
     robot = make_locobot(replace(config.robot), seed, "relmm-train")
-    with robot:
+    with _keyboard(config) as keyboard, robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         run.track()
         with (
@@ -95,18 +98,6 @@ def _train_on_robot(run: Run) -> None:
                 life.look_again()
 
             pause.charged = charged
-            trainer = Trainer(
-                life,
-                run.policy,
-                run.learner,
-                curriculum=config.curriculum.type,
-                pseudo_reset_steps=config.pseudo_reset_steps,
-                rng=run.rng,
-                put_in_reach=(lambda: False) if person is None else person.put_in_reach,
-                progress=run.progress,
-                tidy=(lambda: 0) if person is None else person.tidy,
-                tidy_every=getattr(config.robot, "tidy_every", 0),
-            )
 
             def save() -> None:
                 life.cut_episode()
@@ -114,9 +105,36 @@ def _train_on_robot(run: Run) -> None:
                 run.save(recorder.saved_episodes)
 
             with run.bar("training") as bar:
+                trainer = Trainer(
+                    life,
+                    run.policy,
+                    run.learner,
+                    curriculum=config.curriculum.type,
+                    pseudo_reset_steps=config.pseudo_reset_steps,
+                    rng=run.rng,
+                    put_in_reach=(lambda: False) if person is None else person.put_in_reach,
+                    progress=run.progress,
+                    tidy=(lambda: 0) if person is None else person.tidy,
+                    tidy_every=getattr(config.robot, "tidy_every", 0),
+                    person=_take_over(run, robot, keyboard, bar.write),
+                )
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
     if recorder.saved_episodes > 0:
         print(summarize(config.dataset_root))
+
+
+def _keyboard(config: TrainConfig) -> contextlib.AbstractContextManager[LocobotKeyboard | None]:
+    """Of a person who may take over, if that was asked for."""
+    return contextlib.nullcontext() if config.teleop is None else LocobotKeyboard(config.teleop)
+
+
+def _take_over(
+    run: Run, robot: LocobotRobot, keyboard: LocobotKeyboard | None, say: Callable[[str], None]
+) -> Callable[[], dict[str, float] | None]:
+    if keyboard is None:
+        return lambda: None
+    say(f"{TAKE_OVER} takes over")
+    return TakeOver(robot, keyboard, lambda: run.signals.stopped, say)
 
 
 def _own_dataset(run: Run) -> tuple[int, bool]:

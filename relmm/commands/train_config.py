@@ -8,6 +8,7 @@ from pathlib import Path
 from lerobot.configs.default import WandBConfig
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
+from lerobot.teleoperators.config import TeleoperatorConfig
 
 from relmm.commands.arguments import said
 from relmm.commands.cli import dated_folder
@@ -21,6 +22,7 @@ from relmm.errors import MANY, MAX_SEED, ConfigError, check_range, suggestion
 from relmm.learning.curriculum import CURRICULA
 from relmm.policies.learning import LearningConfig
 from relmm.policies.relmm.configuration_relmm import ReLMMConfig
+from relmm.teleoperator.config_locobot_keyboard import LocobotKeyboardConfig
 
 
 @dataclass
@@ -115,6 +117,7 @@ class TrainConfig(DisplayOptions):
 
     Args:
         robot: `--robot.type=locobot_sim --robot.room=...`; not with `--dataset.follow`.
+        teleop: `--teleop.type=locobot_keyboard` lets a person take over with the key t.
         dataset: where the robot's life is kept, and what is learned from besides.
         policy: `--policy.type=relmm` and its hyper-parameters, or `--policy.path` to go on from.
         curriculum: `--curriculum.type=stationary`, `autonomous` or `none`.
@@ -138,6 +141,7 @@ class TrainConfig(DisplayOptions):
     """
 
     robot: RobotConfig | None = None
+    teleop: TeleoperatorConfig | None = field(default=None, metadata={"choices": LocobotKeyboardConfig})
     dataset: TrainDatasetConfig = field(default_factory=TrainDatasetConfig)
     policy: PreTrainedConfig | None = field(default=None, metadata={"choices": LearningConfig})
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
@@ -176,6 +180,12 @@ class TrainConfig(DisplayOptions):
             raise ConfigError(
                 "Say what to learn from: either a robot (--robot.type=locobot_sim) or a dataset that another process "
                 "records (--dataset.follow=FOLDER), not both."
+            )
+        if self.teleop is not None and self.robot is None:
+            raise ConfigError("--teleop is for a person beside a robot: leave it out with --dataset.follow.")
+        if not isinstance(self.teleop, LocobotKeyboardConfig | None):
+            raise ConfigError(
+                f"teleop.type is {self.teleop.type!r}, but a person takes over with --teleop.type=locobot_keyboard."
             )
         check_camera(self.policy, "robot.camera", self.robot)
         if self.policy.seed is None:

@@ -19,6 +19,7 @@ _PHASES = {
     Phase.LEARNING: "the policy acted",
     Phase.PSEUDO_RESET: "a random walk carried the object elsewhere and put it down",
     Phase.EVALUATION: "the policy was evaluated",
+    Phase.TELEOPERATION: "a person had taken over",
 }
 _EPISODES = {  # by what a run says of itself; LeRobot's own recorder says nothing
     "practice": "An episode goes from the pseudo-reset after one success to the next success, or to a step limit.",

@@ -25,7 +25,8 @@ class Progress:
         attempts, successes: grasps in all, and those that picked something up.
         objects: picked up outside a curriculum.
         pseudo_reset_steps: navigation steps of pseudo-resets.
-        interventions: objects that a person had to put into reach, or to free.
+        interventions: objects that a person had to put into reach, or to free, and times that one charged the robot or
+            took over.
         robot_minutes: on the robot's own clock, over all its lives; the last frame is not over yet.
     """
 

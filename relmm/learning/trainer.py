@@ -34,6 +34,8 @@ class Trainer:
         progress: counts the frames of the run; also one of the life's recorders.
         tidy: lays what is stuck elsewhere; returns how many objects.
         tidy_every: navigation steps after which that is done; 0 for never.
+        person: what a person who has taken over wants to do next; None if nobody has. Asked after every frame, it waits
+            for them.
     """
 
     def __init__(
@@ -49,12 +51,13 @@ class Trainer:
         progress: Progress,
         tidy: Callable[[], int] = lambda: 0,
         tidy_every: int = 0,
+        person: Callable[[], dict[str, float] | None] = lambda: None,
     ) -> None:
         config = policy.config
         self.life, self.policy, self.learner, self.config = life, policy, learner, config
         self.progress, self._row = progress, Row(rng)
         self._put_in_reach, self._pseudo_reset_steps = put_in_reach, pseudo_reset_steps
-        self._tidy, self._tidy_every = tidy, tidy_every
+        self._tidy, self._tidy_every, self._person = tidy, tidy_every, person
         self._stationary = curriculum == "stationary"
         num_max = config.num_max if curriculum == "autonomous" else 0
         self._autonomous = AutonomousCurriculum(config.num_start, config.num_stop, num_max)
@@ -134,8 +137,7 @@ class Trainer:
 
     def _attempt(self, action: dict[str, float], phase: Phase) -> bool:
         """Grasp, learn; whether something was picked up."""
-        self._step(action, phase)
-        success = self.life.succeeded
+        success = self._step(action, phase)
         self.learner.update_grasping(phase)
         return success
 
@@ -155,9 +157,29 @@ class Trainer:
         self._row.attempts = 0
 
     # --- The robot ----------------------------------------------------------------------------------------
-    def _step(self, action: dict[str, float], phase: Phase) -> None:
+    def _step(self, action: dict[str, float], phase: Phase) -> bool:
+        """Act and look; whether something was picked up. Afterwards a person may take over."""
         self.life.step(action, phase, self._row.belief)
         self._observe()
+        success = self.life.succeeded
+        self._let_person_act()
+        return success
+
+    def _let_person_act(self) -> None:
+        """As long as a person wants to; what they do is recorded, and their attempts are learned from."""
+        action = self._person()
+        if action is None:
+            return
+        self.progress.interventions += 1
+        while action is not None:
+            self._look_again()
+            self.life.step(action, Phase.TELEOPERATION)
+            self._observe()
+            if action["skill.pos"] == Skill.GRASP:
+                self.learner.update_grasping(Phase.TELEOPERATION)
+            action = self._person()
+        self._look_again()
+        self._row.attempts = 0
 
     def _look_again(self) -> None:
         """After someone else has changed the room."""

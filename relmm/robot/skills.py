@@ -86,8 +86,9 @@ class Skills:
         return self._detector.scan(self.picture()[1])
 
     def forget_picture(self) -> None:
-        """Take a new picture next time, because someone else has changed the room."""
+        """Take a new picture next time, because someone else has changed the room. The last motion has been told."""
         self._picture = None
+        self._motion = np.zeros(3)
 
     def rest(self) -> None:
         """Fold the arm for driving."""

@@ -20,9 +20,10 @@ from scripted_world import (
     World,
 )
 
-from relmm.features import Phase, Skill, in_grasp_area, xy_to_cell
+from relmm.features import Phase, Skill, action_dict, in_grasp_area, xy_to_cell
 from relmm.learning.progress import Progress
 from relmm.learning.trainer import Trainer
+from relmm.policies.controller import grasp_cell
 from relmm.policies.learning import LearningConfig
 from relmm.policies.relmm_paper.configuration_relmm_paper import RelmmPaperConfig
 
@@ -52,6 +53,7 @@ def make_run() -> MakeRun:
         should_stop: Callable[[], bool] = lambda: False,
         tidy: Callable[[], int] = lambda: 0,
         tidy_every: int = 0,
+        person: Callable[[], dict[str, float] | None] = lambda: None,
         **settings: Any,
     ) -> Run:
         policy = ScriptedPolicy(RelmmPaperConfig(device="cpu", **settings))
@@ -60,7 +62,7 @@ def make_run() -> MakeRun:
         trainer = Trainer(
             life, policy, learner, curriculum=curriculum, pseudo_reset_steps=PSEUDO_RESET_STEPS,
             rng=np.random.default_rng(0), put_in_reach=put_in_reach, progress=progress,
-            tidy=tidy, tidy_every=tidy_every,
+            tidy=tidy, tidy_every=tidy_every, person=person,
         )  # fmt: skip
         return Run(world, trainer, progress, policy, learner)
 
@@ -321,3 +323,35 @@ def test_pseudo_reset_stops_when_told(make_run: MakeRun) -> None:
         run.trainer.navigation_step()
     assert world.events[:3] == [DRIVE, LEARN_DRIVE, GRASP]
     assert len(world.actions) == 4
+
+
+# --- A person who takes over ---------------------------------------------------------------------------------
+def test_what_a_person_does_is_recorded_as_theirs_and_their_attempts_are_learned_from(make_run):
+    world = World(seed=0, success=0.0, wanted=1.0)
+    wishes = iter([None, action_dict(x_vel=0.1), grasp_cell(5), None])
+    run = make_run(world, person=lambda: next(wishes, None), num_grasp=2)
+    world.grasp_wanted = True
+    run.trainer._look_again()
+    looks = world.looks
+    run.trainer.navigation_step()
+    theirs = [("drive", Phase.TELEOPERATION), ("grasp", Phase.TELEOPERATION), LEARN_GRASP]
+    own = [GRASP, *theirs, LEARN_GRASP]
+    assert world.events == [GRASP, LEARN_GRASP, *own, GRASP, LEARN_GRASP, GRASP, LEARN_GRASP, DRIVE, LEARN_DRIVE], (
+        "afterwards the robot has its two attempts again"
+    )
+    assert (run.progress.interventions, run.progress.steps, run.progress.attempts) == (1, 1, 5)
+    # A look after each of 7 frames, and one more before each of the person's and when they give back.
+    assert world.looks - looks == 7 + 3
+    assert run.policy.observed[-1] == world.looks
+
+
+def test_a_person_may_put_down_what_the_robot_holds(make_run):
+    world = World(seed=0, success=1.0, wanted=1.0)
+    world.grasp_wanted = True
+    wishes = iter([action_dict(Skill.PLACE, x=0.4), None])
+    run = make_run(world, person=lambda: next(wishes, None))
+    run.trainer._look_again()
+    run.trainer.navigation_step()
+    assert world.events[:3] == [GRASP, ("place", Phase.TELEOPERATION), LEARN_GRASP]
+    assert run.progress.objects == 1, "the success was the robot's"
+    assert ("place", Phase.PSEUDO_RESET) not in world.events

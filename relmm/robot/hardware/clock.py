@@ -6,8 +6,8 @@ import time
 
 
 def now() -> float:
-    """Seconds since some moment."""
-    return time.monotonic()
+    """Seconds since some moment; on the clock that LeRobot's cameras date their pictures with."""
+    return time.perf_counter()
 
 
 def sleep(seconds: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import cv2
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from relmm.errors import RobotError
 from relmm.features import FloatArray
 from relmm.geometry import CameraGeometry
+from relmm.robot.hardware import clock
 
 WIDTH, HEIGHT, FPS = 640, 480, 30
 _SUPERSAMPLING = 4  # a picture of 100x100 is averaged from one four times as large
@@ -48,7 +48,7 @@ class AlignedRealSense(RealSenseCamera):
         return float(profile.get_device().first_depth_sensor().get_depth_scale() * 1000)
 
     def newest(self) -> tuple[float, NDArray[np.uint8] | None, NDArray[np.uint16] | None]:
-        """When the last pictures came (s of `time.perf_counter`), and both."""
+        """When the last pictures came (s of `clock.now`), and both."""
         with self.frame_lock:
             return self.latest_timestamp or float("-inf"), self.latest_color_frame, self.latest_depth_frame
 
@@ -89,19 +89,19 @@ class D435:
 
     def _fresh(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
         """The first pictures that show nothing older than this call."""
-        earliest = time.perf_counter() + self._latency
+        earliest = clock.now() + self._latency
         while True:
             taken, color, depth = self._camera.newest()
             if taken >= earliest and color is not None and depth is not None:
                 return color, depth
-            if time.perf_counter() > earliest + _LOST_S:
+            if clock.now() > earliest + _LOST_S:
                 raise RobotError(NO_PICTURES)
-            time.sleep(_POLL_S)
+            clock.sleep(_POLL_S)
 
     @property
     def alive(self) -> bool:
         """Whether pictures come."""
-        return time.perf_counter() - self._camera.newest()[0] < _LOST_S
+        return clock.now() - self._camera.newest()[0] < _LOST_S
 
     def close(self) -> None:
         """Stop the camera."""

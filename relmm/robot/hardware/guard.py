@@ -90,7 +90,8 @@ class Guard:
             self._write(STOP)
 
     def _read(self) -> None:
-        assert self._serial is not None
+        if self._serial is None:  # lost while the program's bytes were passed on
+            return
         try:
             data = self._serial.read(_CHUNK)
         except OSError:  # serial.SerialException is one

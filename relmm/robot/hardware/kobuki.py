@@ -190,10 +190,13 @@ class Kobuki:
             with self._lock:
                 for payload in self._reader.feed(data or b""):
                     self._take(decode(payload))
-                # Also when nothing has come: the guard takes silence for the end of this program.
-                if (clock.now() >= due or data is None) and self._open:
+                if not self._open:
+                    break
+                if clock.now() >= due:
                     due = clock.now() + PERIOD_S
                     self._approach_goal()
+                    self._send_command()
+                elif data is None:  # the guard takes silence for the end of this program
                     self._send_command()
 
     def _take(self, feedback: Feedback | None) -> None:

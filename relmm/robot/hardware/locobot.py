@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from relmm.errors import RobotError
@@ -13,6 +14,7 @@ from relmm.robot.hardware.body import LocobotBody
 from relmm.robot.hardware.calibration import Calibration, load_calibration, save_calibration
 from relmm.robot.hardware.config_locobot import LocobotConfig
 from relmm.robot.hardware.d435 import D435
+from relmm.robot.hardware.guided import STEPS, ask
 from relmm.robot.hardware.kobuki import Kobuki
 from relmm.robot.hardware.ports import find_port
 from relmm.robot.hardware.widowx import WidowX
@@ -39,17 +41,30 @@ class Locobot(LocobotRobot):
         return bool(self.calibration_fpath.is_file())
 
     def calibrate(self) -> None:
-        """Say how it is done: it takes a person, and some floor.
+        """Guide a person at the terminal through all measurements; `lerobot-calibrate` calls this.
 
         Raises:
-            RobotError: always.
+            ConfigError: nobody is there.
+            RobotError: something could not be measured; what was measured before is saved.
         """
-        raise RobotError("Calibrate a LoCoBot with relmm-calibrate --robot.type=locobot, which guides you through it.")
+        self.measure(list(STEPS))
 
-    def take_measured(self, calibration: Calibration) -> None:
-        """Use another calibration from the next connection on, and save it."""
-        self.measured = calibration
-        self._save_calibration()
+    def measure(self, names: Sequence[str]) -> None:
+        """Go through some of `STEPS`; what one has found is saved and used before the next one.
+
+        Raises:
+            ConfigError, RobotError: as `calibrate`.
+        """
+        for number, name in enumerate(names, 1):
+            step = STEPS[name]
+            ask(f"{number}/{len(names)} {name}. {step.prepare}")
+            self.disconnect()
+            with self:
+                values = step.measure(self.body, self.measured)
+            self.measured = replace(self.measured, **values)
+            self._save_calibration()
+            print(f"  {', '.join(f'{key} = {value}' for key, value in values.items())}")
+        print(f"saved in {self.calibration_fpath}")
 
     def _load_calibration(self, fpath: Path | None = None) -> None:
         self.measured = load_calibration(fpath or self.calibration_fpath)
@@ -65,7 +80,7 @@ class Locobot(LocobotRobot):
             RobotError: something is missing or broken; says what to do. Nothing moves then.
         """
         if not self.is_calibrated:
-            logger.warning("%s has not been calibrated: run relmm-calibrate --robot.type=locobot first.", self)
+            logger.warning("This LoCoBot has not been calibrated: run relmm-calibrate --robot.type=locobot first.")
         try:
             super().connect(calibrate)
         except BaseException:

@@ -25,6 +25,7 @@ MIDDLE = 2048  # ticks at 0 rad
 POSITION_MODE, PWM_MODE = 3, 16
 _REVERSE, _TIME_BASED = 1, 4  # bits of the drive mode
 _NO_SECONDARY = 255
+_READ_S = 0.002
 _VELOCITY_LIMIT = 131  # of 0.229 turns a minute: pi rad/s
 
 
@@ -118,6 +119,14 @@ class LocobotMotorsBus(DynamixelMotorsBus):
         # The SDK of LeRobot's range flushes what it sends here, and not what it has received: an answer that came too
         # late would be taken for that of the next question, and so on for ever.
         self.port_handler.clearPort = lambda: self.port_handler.ser.reset_input_buffer()
+        self.port_handler.readPort = self._read_port
+
+    def _read_port(self, length: int) -> bytes:
+        """Wait a moment for that many bytes. The SDK asks again and again, and would keep a processor busy with it."""
+        port = self.port_handler.ser
+        if port.timeout != _READ_S:
+            port.timeout = _READ_S
+        return bytes(port.read(length))
 
     def ping(self, motor: str | int, num_retry: int = 2, raise_on_error: bool = False) -> int | None:
         """Model of a motor, None if it is silent.

@@ -7,6 +7,7 @@ import math
 from relmm.robot.hardware.kobuki_protocol import M_PER_TICK, WHEELBASE, Feedback
 
 _TURN = 65_536  # at which encoders wrap
+_FARTHEST = 0.5  # m, more than a wheel rolls between two readings; the check sum lets every 40th damaged frame through
 
 
 class Odometry:
@@ -38,6 +39,9 @@ class Odometry:
             wrapped(now - before, _TURN) * self._m_per_tick
             for now, before in ((feedback.left, last.left), (feedback.right, last.right))
         )
+        if max(abs(left), abs(right)) > _FARTHEST:
+            self.forget_position()
+            return
         self.travelled += (left + right) / 2
         if driving and feedback.angle is not None and last.angle is not None:
             self.heading += wrapped(feedback.angle - last.angle, 360.0)
@@ -45,7 +49,7 @@ class Odometry:
             self.heading += math.degrees((right - left) / WHEELBASE)
 
     def forget_position(self) -> None:
-        """Go on from the next reading: the base was switched off, and its counters begin anew."""
+        """Go on from the next reading: the base was switched off and its counters begin anew, or a reading is wrong."""
         self._last = None
 
 

@@ -2,21 +2,21 @@
 
 import importlib
 import importlib.util
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from itertools import count
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
-HERE = Path(__file__).parent
-FAKES = HERE / "fakes"
 # The SDK waits for answers in a busy loop; an emulator in the same process has to get its turn.
 sys.setswitchinterval(0.0005)
-sys.path.insert(0, str(HERE))
+sys.path.insert(0, str(Path(__file__).parent))
+
+from emulated_process import FAKES, Emulated  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -42,64 +42,36 @@ def realsense(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     sys.modules.pop("pyrealsense2", None)
 
 
-class Emulated:
-    """An emulated LoCoBot in a process of its own.
-
-    Args:
-        folder: of its devices.
-        environment: for programs that drive it.
-        process: it.
-    """
-
-    def __init__(self, folder: Path, environment: dict[str, str], process: subprocess.Popen[str]) -> None:
-        self.folder, self.environment, self.process = folder, environment, process
-        self.options = [
-            "--robot.type=locobot",
-            f"--robot.base_port={folder}/kobuki",
-            f"--robot.arm_port={folder}/dxl",
-            f"--robot.calibration_dir={folder}/calibration",
-        ]
-
-    def put(self, x: float, y: float) -> None:
-        """Lay the first object down as a person would; m, robot frame."""
-        self.process.stdin.write(f"put {x} {y}\n")
-        self.process.stdin.flush()
-        assert self.process.stdout.readline() == "put\n"
+@pytest.fixture
+def emulate(tmp_path: Path) -> Iterator[Callable[..., Emulated]]:
+    """Start an emulated LoCoBot, see `Emulated`; it ends with the test."""
+    with ExitStack() as running:
+        numbers = count()
+        yield lambda **settings: running.enter_context(Emulated(tmp_path / f"locobot_{next(numbers)}", **settings))
 
 
 @pytest.fixture
-def emulate(tmp_path: Path) -> Iterator[Callable[..., Emulated]]:
-    """Start an emulated LoCoBot; it ends with the test."""
-    running = []
+def live_in_emulator(realsense: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Emulated], Any]]:
+    """Connect to an emulated LoCoBot in this process, and live in its time until the test ends."""
+    from emulated_time import SharedTime, live_in
 
-    def start(room: str = "no_obstacles", num_objects: int = 20, seed: int = 0, speed: float = 1.0) -> Emulated:
-        folder = tmp_path / f"locobot_{len(running)}"
-        folder.mkdir()
-        command = [sys.executable, str(HERE / "emulated_locobot.py"), str(folder), room]
-        process = subprocess.Popen(
-            [*command, str(num_objects), str(seed), str(speed)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        running.append(process)
-        assert process.stdout.readline() == "ready\n"
-        path = os.pathsep.join([str(FAKES), os.environ.get("PYTHONPATH", "")])
-        environment = {
-            **os.environ,
-            "PYTHONPATH": path,
-            "RELMM_FAKE_REALSENSE": str(folder / "camera"),
-            "RELMM_FAKE_REALSENSE_FPS": "6",
-        }
-        return Emulated(folder, environment, process)
+    from relmm.robot.hardware.config_locobot import LocobotConfig
+    from relmm.robot.hardware.locobot import Locobot
 
-    yield start
-    for process in running:
-        process.stdin.close()
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
+    with ExitStack() as connections:
+
+        def connect(emulated: Emulated) -> Locobot:
+            live_in(SharedTime(emulated.folder / "time"), monkeypatch.setattr)
+            monkeypatch.setenv("RELMM_FAKE_REALSENSE", emulated.environment["RELMM_FAKE_REALSENSE"])
+            monkeypatch.setattr(realsense, "fps", 10.0)
+            config = LocobotConfig(
+                base_port=str(emulated.folder / "kobuki"),
+                arm_port=str(emulated.folder / "dxl"),
+                calibration_dir=emulated.folder / "calibration",
+            )
+            return connections.enter_context(Locobot(config))
+
+        yield connect
 
 
 @contextmanager

@@ -219,7 +219,7 @@ class DynamixelEmulator:
                     self._pending += data
                     self._obey()
             if not data:
-                time.sleep(0.0005)
+                self.cable.wait(0.002)
 
     def _let_time_pass(self) -> None:
         now = self.now()

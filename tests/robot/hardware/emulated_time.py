@@ -9,9 +9,15 @@ from __future__ import annotations
 import mmap
 import struct
 import time
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 _POLL_S = 0.0003
+_STILL_S = 0.05  # of our time: the robot's stands still, and a camera goes on sending what it sees
+# The SDK allows an answer 34 ms, and the driver its guard 5 s. On a busy machine both may take longer.
+_PATIENCE_MS, _START_S = 5000, 60.0
 
 
 class SharedTime:
@@ -43,3 +49,23 @@ class SharedTime:
         struct.pack_into("d", self._memory, 8, max(until, self.allowed()))
         while self.now() < until - 1e-9:
             time.sleep(_POLL_S)
+
+
+def live_in(shared: SharedTime, replace: Callable[[object, str, object], None] = setattr) -> None:
+    """Let this process's driver of a LoCoBot live in an emulated time.
+
+    Args:
+        shared: that time.
+        replace: `setattr`, or pytest's, which puts back what was there.
+    """
+    camera, fake = import_module("lerobot.cameras.realsense.camera_realsense"), import_module("pyrealsense2")
+    clock = import_module("relmm.robot.hardware.clock")
+    replace(clock, "now", shared.now)
+    replace(clock, "sleep", shared.sleep)
+    replace(fake, "now", shared.now)
+    replace(fake, "still_s", _STILL_S)
+    # LeRobot dates a picture when it has taken it over, which may be late.
+    dates = SimpleNamespace(perf_counter=lambda: fake.taken, time=time.time, sleep=time.sleep)
+    replace(camera, "time", dates)
+    replace(import_module("dynamixel_sdk.port_handler"), "LATENCY_TIMER", _PATIENCE_MS)
+    replace(import_module("relmm.robot.hardware.kobuki"), "_START_S", _START_S)

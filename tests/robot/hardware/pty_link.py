@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pty
+import select
 import tty
 from pathlib import Path
 
@@ -44,6 +45,11 @@ class Cable:
             return os.read(self._master, 65536) if self.plugged else b""
         except BlockingIOError:
             return b""
+
+    def wait(self, seconds: float) -> None:
+        """Until something comes, at most so long."""
+        with contextlib.suppress(OSError, ValueError):  # it is being unplugged
+            select.select([self._master] if self.plugged else [], [], [], seconds)
 
     def write(self, data: bytes) -> None:
         if self.plugged:

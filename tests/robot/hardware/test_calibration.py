@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+import math
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +14,15 @@ from relmm.geometry import CAMERAS, CameraGeometry
 from relmm.robot.hardware.calibration import Calibration, load_calibration, save_calibration
 from relmm.robot.hardware.config_locobot import LocobotConfig
 from relmm.robot.hardware.locobot import Locobot
-from relmm.robot.hardware.measuring import fit_grasp, floor_plane
+from relmm.robot.hardware.measuring import (
+    _point,
+    fit_grasp,
+    floor_plane,
+    measure_camera,
+    measure_grasp,
+    measure_wheels,
+)
+from relmm.robot.skills import REST_POSE
 
 LENS = np.array([615.0, 615.3, 322.5, 238.5])
 
@@ -93,17 +98,8 @@ def test_damaged_calibration_is_one_sentence(tmp_path, change, words):
 def test_command_measures_camera_gripper_and_sag(emulate):
     pytest.importorskip("serial", reason="pyserial is not installed (the extra `hardware`)")
     pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
-    emulated = emulate(num_objects=1, speed=0.0)
-    here = Path(__file__).parent
-    command = [sys.executable, str(here / "locobot_command.py"), str(emulated.folder), "relmm.commands.calibrate"]
-    done = subprocess.run(
-        [*command, *emulated.options, "--robot.id=me", "--steps=[camera,gripper,arm]"],
-        input="\n\n\n",
-        env={**emulated.environment, "PYTHONPATH": emulated.environment["PYTHONPATH"] + os.pathsep + str(here)},
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
+    emulated = emulate(num_objects=1)
+    done = emulated.run("relmm.commands.calibrate", "--robot.id=me", "--steps=[camera,gripper,arm]", said="\n\n\n")
     assert done.returncode == 0, done.stderr
     measured = load_calibration(emulated.folder / "calibration" / "me.json")
     assert measured.camera_height == pytest.approx(CAMERAS["d435"].position[2], abs=0.004)
@@ -111,3 +107,61 @@ def test_command_measures_camera_gripper_and_sag(emulate):
     assert measured.closed_opening == pytest.approx(0.0, abs=0.002)
     assert 0.01 < measured.arm_delay < 0.1
     assert np.abs(measured.sag).max() < 0.03, "the simulated arm hardly hangs"
+
+
+# --- Errors that are known -----------------------------------------------------------------------------------
+SPOTS = np.array([(0.33, -0.05), (0.33, 0.05), (0.43, -0.05), (0.43, 0.05), (0.38, 0.0)])
+
+
+@pytest.fixture
+def faulty(emulate, live_in_emulator):
+    """Starts an emulated robot with faults; it, and the robot that drives it."""
+
+    def start(**faults: float):
+        emulated = emulate(num_objects=1, **faults)
+        emulated.order("put", -0.6, 0.0)  # out of the way
+        return emulated, live_in_emulator(emulated)
+
+    return start
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("height", "pitch"), [(0.012, 1.5), (-0.01, -2.0)])
+def test_camera_that_hangs_elsewhere_is_found(faulty, height, pitch):
+    _, robot = faulty(camera_height=height, camera_pitch=pitch)
+    found = measure_camera(robot.body, np.random.default_rng(0))
+    assert found["camera_height"] == pytest.approx(CAMERAS["d435"].position[2] + height, abs=0.002)
+    assert found["camera_pitch"] == pytest.approx(CAMERAS["d435"].pitch + pitch, abs=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.95, 1.04])
+def test_wheels_of_another_size_are_found(faulty, scale):
+    emulated, robot = faulty(wheel_scale=scale)
+    emulated.order("carry", 0.9, 0.0, 0.0)  # 0.6 m in front of a wall
+    assert measure_wheels(robot.body, 1.0)["wheel_scale"] == pytest.approx(scale, abs=0.01)
+
+
+@pytest.mark.slow
+def test_waist_that_is_mounted_askew_is_found(faulty):
+    """Three degrees, that is 2 cm aside at the grasp area."""
+    emulated, robot = faulty(waist=3.0)
+
+    def person(what: str) -> None:
+        emulated.order("stick") if what.startswith("Put") else emulated.order("put", -0.6, 0.0)
+
+    def errors() -> list[float]:
+        """How far from a place of the floor the gripper is that was sent there, m."""
+        for x, y in SPOTS:
+            _point(robot.body, x, y)
+            yield math.dist(emulated.order("gripper"), (x, y))
+            robot.body.move_arm(REST_POSE, 2.0)
+            robot.body.wait(2.6)
+
+    before = list(errors())
+    found = measure_grasp(robot.body, person, np.array(Calibration().grasp))
+    robot.body._calibration = replace(Calibration(), **found)
+    after = list(errors())
+    print(f"the gripper was {np.round(before, 4)} m off, and is {np.round(after, 4)} m off")
+    assert max(before) > 0.015
+    assert max(after) < 0.004

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -14,38 +10,12 @@ pytest.importorskip("serial", reason="pyserial is not installed (the extra `hard
 pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed (the extra `hardware`)")
 pytestmark = pytest.mark.slow  # real protocols in real time, which a busy machine upsets
 
-from dynamixel_sdk import port_handler
-from emulated_time import SharedTime
-from locobot_command import PATIENCE_MS
-
 from relmm.features import MAX_THETA_VEL, MAX_X_VEL, action_dict
-from relmm.robot.hardware import clock
-from relmm.robot.hardware.config_locobot import LocobotConfig
-from relmm.robot.hardware.locobot import Locobot
-
-HERE = Path(__file__).parent
 
 
 @pytest.fixture
-def robot(emulate, realsense, monkeypatch, request):
-    emulated = emulate(**getattr(request, "param", {}), speed=0.0)
-    shared = SharedTime(emulated.folder / "time")
-    monkeypatch.setattr(clock, "now", shared.now)
-    monkeypatch.setattr(clock, "sleep", shared.sleep)
-    monkeypatch.setattr(port_handler, "LATENCY_TIMER", PATIENCE_MS)
-    for name in ("RELMM_FAKE_REALSENSE", "RELMM_FAKE_REALSENSE_FPS"):
-        monkeypatch.setenv(name, emulated.environment[name])
-    monkeypatch.setattr(realsense, "fps", 15.0)
-    robot = Locobot(
-        LocobotConfig(
-            base_port=str(emulated.folder / "kobuki"),
-            arm_port=str(emulated.folder / "dxl"),
-            calibration_dir=emulated.folder / "calibration",
-        )
-    )
-    robot.connect()
-    yield robot
-    robot.disconnect()
+def robot(emulate, live_in_emulator):
+    return live_in_emulator(emulate())
 
 
 def test_robot_drives_and_turns_as_told(robot):
@@ -60,26 +30,12 @@ def test_robot_drives_and_turns_as_told(robot):
     assert robot.get_observation()["theta.vel"] == pytest.approx(MAX_THETA_VEL, abs=30)
 
 
-def run_command(emulated, module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    path = f"{emulated.environment['PYTHONPATH']}{os.pathsep}{HERE}"
-    command = [sys.executable, str(HERE / "locobot_command.py"), str(emulated.folder), module]
-    return subprocess.run(
-        [*command, *emulated.options, *arguments],
-        env={**emulated.environment, "PYTHONPATH": path, "RELMM_FAKE_REALSENSE_FPS": "15"},
-        capture_output=True,
-        text=True,
-        timeout=550,
-        stdin=subprocess.DEVNULL,
-    )
-
-
-@pytest.mark.slow
 def test_scripted_policy_picks_things_up(emulate, tmp_path):
     """Through the bytes, by the robot's own judgement, which the simulator confirms elsewhere."""
     options = ["--policy.type=relmm_scripted", "--policy.camera=d435", "--dataset.repo_id=me/x"]
     limits = ["--dataset.num_episodes=2", "--max_steps=40", "--pseudo_reset_steps=2"]
     root = tmp_path / "x"
-    done = run_command(emulate(), "relmm.commands.record", *options, *limits, f"--dataset.root={root}")
+    done = emulate().run("relmm.commands.record", *options, *limits, f"--dataset.root={root}")
     assert done.returncode == 0, done.stderr
     assert "robot_type" in (root / "meta" / "info.json").read_text()
     episodes, success = re.search(r"episodes +(\d+) \((\d+) by success", done.stdout).groups()
@@ -87,13 +43,12 @@ def test_scripted_policy_picks_things_up(emulate, tmp_path):
     assert int(success) >= 1
 
 
-@pytest.mark.slow
 def test_training_learns_from_it_and_goes_on(emulate, tmp_path):
     folder = tmp_path / "run"
     options = ["--policy.camera=d435", "--policy.num_stationary=1", "--curriculum.type=none", "--env_eval_freq=0"]
     options += ["--policy.min_attempts_to_update=2", "--policy.batch_size=8", f"--output_dir={folder}", "--save_freq=2"]
-    done = run_command(emulate(), "relmm.commands.train", *options, "--steps=4")
+    done = emulate().run("relmm.commands.train", *options, "--steps=4")
     assert done.returncode == 0, done.stderr
-    done = run_command(emulate(), "relmm.commands.train", *options, "--steps=6", "--resume=true")
+    done = emulate().run("relmm.commands.train", *options, "--steps=6", "--resume=true")
     assert done.returncode == 0, done.stderr
     assert (folder / "checkpoints" / "000006").is_dir()

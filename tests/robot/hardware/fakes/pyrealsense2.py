@@ -7,6 +7,7 @@ In one process set `source`; between two, the environment variable RELMM_FAKE_RE
 from __future__ import annotations
 
 import os
+import struct
 import time
 from collections.abc import Callable
 from enum import Enum, auto
@@ -18,6 +19,7 @@ import numpy as np
 # A D435's colour stream of 640x480, by its own calibration; its middle is never quite that of the picture.
 INTRINSICS = SimpleNamespace(width=640, height=480, fx=615.0, fy=615.3, ppx=322.5, ppy=238.5)
 SERIAL = "821212062500"
+_POLL_S = 0.001
 
 
 class stream(Enum):
@@ -55,6 +57,8 @@ class _Source:
             self._connection = Client(os.environ["RELMM_FAKE_REALSENSE"], "AF_UNIX")
         try:
             self._connection.send(None)
+            global taken
+            (taken,) = struct.unpack("d", self._connection.recv_bytes())
             height, width = INTRINSICS.height, INTRINSICS.width
             rgb = np.frombuffer(self._connection.recv_bytes(), np.uint8).reshape(height, width, 3)
             depth = np.frombuffer(self._connection.recv_bytes(), np.uint16).reshape(height, width)
@@ -68,6 +72,9 @@ source: Callable[[], tuple[np.ndarray, np.ndarray]] = _Source()  # colour, and d
 fps = float(os.environ.get("RELMM_FAKE_REALSENSE_FPS", "30"))
 plugged = 1  # how many cameras there are
 started = 0  # pipelines that run
+now: Callable[[], float] = time.monotonic  # the robot's time
+taken = 0.0  # when the newest picture from a socket was taken, in the robot's time
+still_s = float("inf")  # of our time after which the same picture comes again: the robot's time stands still
 
 
 class device:
@@ -166,8 +173,10 @@ class pipeline:
         return pipeline_profile(settings.streams)
 
     def try_wait_for_frames(self, timeout_ms: int = 5000) -> tuple[bool, composite_frame | None]:
-        time.sleep(max(self._next - time.monotonic(), 0.0))
-        self._next = time.monotonic() + 1 / fps
+        patience = time.monotonic() + still_s
+        while now() < self._next and time.monotonic() < patience:
+            time.sleep(_POLL_S)
+        self._next = now() + 1 / fps
         try:
             return True, composite_frame(*source())
         except RuntimeError:
