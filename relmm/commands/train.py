@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,12 @@ from relmm.commands.robots import Pause, make_locobot
 from relmm.commands.sharing import check_uploads
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
+from relmm.commands.train_stream import train_on_stream
 from relmm.commands.training_bar import TrainingBar
 from relmm.commands.training_run import Run
 from relmm.episodes import (
-    Episode,
-    EpisodeFollower,
     EpisodeRecorder,
     check_new,
-    saved_episodes,
     summarize,
     verify_and_repair,
 )
@@ -39,7 +35,6 @@ from relmm.sim.locobot_sim import LocobotSim
 from relmm.sim.person import Person
 
 _PERSON_STREAM = 4  # keeps random numbers of one seed apart
-_POLL_S = 0.5  # between looks at a dataset that is followed
 
 
 def train(config: TrainConfig) -> None:
@@ -51,7 +46,7 @@ def train(config: TrainConfig) -> None:
     with StopOnSignal() as signals:
         run = Run(config, signals)
         if config.dataset.follow is not None:
-            _train_on_stream(run, config.dataset.follow)
+            train_on_stream(run)
         else:
             _train_on_robot(run)
     assert config.output_dir is not None
@@ -168,27 +163,6 @@ def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:
         return scores
 
     return evaluate
-
-
-def _train_on_stream(run: Run, root: Path) -> None:
-    run.check_cursor(saved_episodes(root))
-    run.read_initial_data()
-    follower = EpisodeFollower(root, run.read_own_data(), run.policy.config.camera)
-
-    def episodes() -> Iterator[Episode]:
-        while not run.signals.stopped:
-            before = follower.next
-            for episode in follower.read_new():
-                yield episode
-                if run.signals.stopped:
-                    return
-            if follower.next == before:
-                time.sleep(_POLL_S)
-
-    with run.bar(f"following {root}") as bar:
-        if not root.exists():
-            bar.write(f"waiting for {root}, which is not there yet: start its recorder, or check the name")
-        run.session(lambda: run.save(follower.next), dict, bar).follow(episodes())
 
 
 def main() -> None:

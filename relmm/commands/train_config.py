@@ -27,7 +27,10 @@ class TrainDatasetConfig:
         repo_id: name of the dataset, `user/name`.
         root: its folder; None for `dataset` in the output folder.
         init: a dataset (folder, or user/name on the Hub) to fill the replay with and train on first.
-        follow: a dataset that another process is recording; there is no robot then.
+        follow: datasets that other processes are recording, or folders of such datasets, with commas between them;
+            there is no robot then.
+        max_waiting: episodes of these that may wait for the learner; what comes while more do is remembered, but
+            without updates of its own.
         push_to_hub: upload it to `repo_id` at the end, and every `hub.every` steps.
         private: whether a new repository is private; None for the owner's default.
         license: for its card, an identifier of the Hub.
@@ -36,13 +39,20 @@ class TrainDatasetConfig:
     repo_id: str = "local/relmm"
     root: Path | None = None
     init: str | None = None
-    follow: Path | None = None
+    follow: str | None = None
+    max_waiting: int = 100
     push_to_hub: bool = False
     private: bool | None = None
     license: str = LICENSE
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
+        check_range("dataset.max_waiting", self.max_waiting, 0, MANY)
+        if self.follow is not None and not all(self.follow.split(",")):
+            raise ConfigError(
+                f"dataset.follow is {self.follow!r}, which has an empty name in it: say --dataset.follow=FOLDER or "
+                "--dataset.follow=FOLDER,FOLDER,..."
+            )
         if self.push_to_hub and self.repo_id.startswith("local/"):
             raise ConfigError(
                 f"dataset.repo_id is {self.repo_id!r}, which is on this machine only: also say "
@@ -166,8 +176,8 @@ class TrainConfig:
                     "folder, or train into another one without --resume."
                 )
             raise ConfigError(
-                "Say what to learn from: either a robot (--robot.type=locobot_sim) or a dataset that another process "
-                "records (--dataset.follow=FOLDER), not both."
+                "Say what to learn from: either a robot (--robot.type=locobot_sim) or datasets that other processes "
+                "record (--dataset.follow=FOLDER,FOLDER,...), not both."
             )
         check_camera(self.policy, "robot.camera", self.robot)
         if self.policy.seed is None:
@@ -201,6 +211,11 @@ class TrainConfig:
             raise ConfigError(
                 f"{self.output_dir} exists already: choose another --output_dir, or go on with --resume=true."
             )
+
+    @property
+    def followed(self) -> list[Path]:
+        """The datasets, and folders of datasets, of others that are learned from."""
+        return [] if self.dataset.follow is None else [Path(name) for name in self.dataset.follow.split(",")]
 
     @property
     def checkpoints(self) -> Path:

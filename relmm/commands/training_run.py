@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from relmm.episodes import (
 )
 from relmm.episodes.folder import DatasetFolder
 from relmm.episodes.info import runs_of
+from relmm.episodes.sources import Cursor
 from relmm.episodes.upload import recorded_runs
 from relmm.errors import ConfigError
 from relmm.learning.checkpoint import (
@@ -66,6 +67,7 @@ class Run:
         self.learner = policy.make_learner(config.seed, config.replay_frames)
         self.rng = np.random.default_rng([config.seed, _STREAM])
         self.progress = Progress()
+        self.words: Callable[[], str] = str  # more of them for the progress bar
         self.learned = 0  # episodes of the run's dataset that the checkpoint has learned from
         if self.checkpoint is not None:
             counters = load_training_state(self.checkpoint, self.learner, self.rng)
@@ -75,8 +77,8 @@ class Run:
 
     @property
     def data(self) -> Path:
-        """The folder of the dataset that the run learns from."""
-        return self.config.dataset.follow or self.config.dataset_root
+        """The folder of the dataset that the run records and learns from."""
+        return self.config.dataset_root
 
     def check_cursor(self, episodes: int) -> None:
         """Refuse to go on without the data that the checkpoint has learned from.
@@ -117,11 +119,14 @@ class Run:
                 episodes = episode.index + 1
         return episodes
 
-    def save(self, episodes: int) -> None:
+    def save(self, episodes: int, runs: list[dict[str, Any]] | None = None, sources: Sequence[Cursor] = ()) -> None:
         """Write a checkpoint.
 
         Args:
-            episodes: of the run's dataset that the weights have learned from; a resumed run learns the later ones.
+            episodes: that the weights have learned from, of the run's dataset or of those of others; a resumed run
+                learns the later ones.
+            runs: with what they were recorded; None for those of the run's own dataset.
+            sources: how far each dataset of others has been learned from.
         """
         counters = {"episodes": episodes, "interventions": self.progress.interventions}
         save_checkpoint(
@@ -132,7 +137,8 @@ class Run:
             self.rng,
             counters,
             self.saved_config,
-            recorded_runs(DatasetFolder(self.data)),
+            recorded_runs(DatasetFolder(self.data)) if runs is None else runs,
+            sources,
         )
 
     def bar(self, title: str) -> TrainingBar:
@@ -158,6 +164,7 @@ class Run:
 
         def show(status: dict[str, Any]) -> None:
             words = f"{status['objects']} objects, {status['successes']}/{status['attempts']} grasps"
+            words = ", ".join(filter(None, [words, self.words()]))
             bar.advance("practice", status["practice_attempts"], words)
             bar.advance("steps", status["steps"], words)
             self.uploads.check()
@@ -179,7 +186,9 @@ def _settings_to_keep(config: TrainConfig) -> dict[str, Any]:
     """For a resume, which may come from another folder: as given, but with whole paths."""
     settings: dict[str, Any] = draccus.encode(config)
     dataset = settings["dataset"]
-    for name in ("root", "follow", "init"):
+    if dataset["follow"] is not None:
+        dataset["follow"] = ",".join(str(place.absolute()) for place in config.followed)
+    for name in ("root", "init"):
         # What does not exist yet is a folder, too, but for `init`: that may be a name on the Hub.
         if dataset[name] is not None and (name != "init" or Path(dataset[name]).exists()):
             dataset[name] = str(Path(dataset[name]).absolute())

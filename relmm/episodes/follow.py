@@ -25,7 +25,7 @@ from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
 from relmm.episodes.survey import read_columns, read_places, rows_of
 from relmm.episodes.video import VIDEO_COLUMNS, in_video, read_video
 from relmm.errors import DatasetError
-from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
+from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES, WEIGHTS_STEP
 
 _WRONG_TYPES = (ValueError, TypeError, AttributeError, KeyError, pa.ArrowException)  # of columns of other types
 MAX_STEPS = 10_000  # navigation steps of an episode, and of a pseudo-reset before and after it
@@ -47,6 +47,7 @@ class Episode:
         phases: (n,) int64, a `relmm.features.Phase` each.
         grasp_probabilities: (n,) float32, P[grasp], -1 where it was not asked.
         robot_times: (n,) float32, s on the robot's clock.
+        weights_step: steps of the learner whose weights acted last, -1 where that is not known.
     """
 
     index: int
@@ -59,6 +60,7 @@ class Episode:
     phases: NDArray[np.int64]
     grasp_probabilities: NDArray[np.float32]
     robot_times: NDArray[np.float32]
+    weights_step: int = -1
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -154,7 +156,8 @@ class EpisodeFollower:
             return None
         check_trainable(self._folder.root, self._camera)
         filmed = in_video(info["features"])
-        columns = [name for name in TRAINING_COLUMNS if name in info["features"] and not (filmed and name == IMAGE_KEY)]
+        wanted = (*TRAINING_COLUMNS, WEIGHTS_STEP)
+        columns = [name for name in wanted if name in info["features"] and not (filmed and name == IMAGE_KEY)]
         return _Layout(str(info["data_path"]), ["episode_index", "index", *columns], float(info["fps"]), filmed)
 
     def _new_rows(self) -> Iterator[dict[str, Any]]:
@@ -260,7 +263,16 @@ class _DataFiles:
             phases=_numbers(frames["complementary_info.phase"], np.int64),
             grasp_probabilities=_numbers(frames["complementary_info.grasp_probability"], np.float32),
             robot_times=_numbers(frames["complementary_info.robot_time"], np.float32),
+            weights_step=int(_numbers(frames[WEIGHTS_STEP], np.int64)[-1])
+            if WEIGHTS_STEP in frames.column_names
+            else -1,
         )
+
+
+def _weights_step(frames: pa.Table) -> int:
+    if WEIGHTS_STEP not in frames.column_names or not len(frames):
+        return -1
+    return int(_numbers(frames[WEIGHTS_STEP], np.int64)[-1])
 
 
 def _numbers(column: pa.ChunkedArray, dtype: DTypeLike) -> NDArray[Any]:

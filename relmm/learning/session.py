@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from relmm.episodes.follow import Episode
+from relmm.learning.intake import Intake
 from relmm.learning.progress import Metrics, Progress
 from relmm.learning.trainer import Trainer
 from relmm.policies.learning import Learner
@@ -64,6 +65,7 @@ class Session:
         self._started = time.monotonic() - metrics.seconds  # a resumed run goes on
         self._saved_at = -1
         self._logged: dict[str, float] = {}
+        self._more_logs: Callable[[], dict[str, float]] = dict
 
     def live(self, trainer: Trainer, should_stop: Callable[[], bool]) -> None:
         """Train on a robot until the last step, or until told to stop; ends with a checkpoint."""
@@ -80,14 +82,22 @@ class Session:
             self._after(before)
         self._end()
 
-    def follow(self, episodes: Iterable[Episode]) -> None:
-        """Train on episodes that come in from elsewhere, until the last step or the last of them."""
+    def follow(self, episodes: Iterable[tuple[str, Episode]], intake: Intake) -> None:
+        """Train on episodes that come in from elsewhere, until the last step or the last of them.
+
+        Args:
+            episodes: with the dataset that each is of.
+            intake: takes them, and tells how well it keeps up.
+        """
         self._begin()
-        for episode in episodes:
+        self._more_logs = intake.logs
+        for source, episode in episodes:
             before = self._progress.steps
-            self._progress.read(episode)
-            self._learner.read(episode, update=True)
-            self._after(before, save=True)
+            intake.take(episode, source)
+            saved_at, started = self._saved_at, time.monotonic()
+            self._after(before, save=intake.weights_are_due)
+            if self._saved_at != saved_at:
+                intake.saved(time.monotonic() - started)
             if self._progress.steps >= self._schedule.steps:
                 break
         self._end()
@@ -116,7 +126,7 @@ class Session:
 
     def _log(self) -> None:
         self._logged = self._progress.asdict()
-        self._metrics.write(**self._status(), **self._learner.logs)
+        self._metrics.write(**self._status(), **self._learner.logs, **self._more_logs())
 
     def _checkpoint(self) -> None:
         if self._saved_at != self._progress.steps:
