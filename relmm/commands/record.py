@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,9 @@ from lerobot.robots.config import RobotConfig
 
 from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.policies import FreshWeights, check_camera, make_actor, policy_from_path, take_seed
-from relmm.commands.robots import Pause, make_locobot
+from relmm.commands.robots import Pause, make_locobot, person_beside
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
+from relmm.commands.train_config import CurriculumConfig
 from relmm.commands.upload import LICENSE
 from relmm.episodes import (
     MAX_STEPS,
@@ -23,13 +24,16 @@ from relmm.episodes import (
     check_new,
     check_repo_id,
     check_resume,
+    read_episodes,
     summarize,
     verify_and_repair,
 )
 from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
 from relmm.learning.actor import Actor
-from relmm.learning.collect import Cleaner, Collector
+from relmm.learning.collect import Cleaner, Collector, Practice, Watcher
 from relmm.learning.life import Life
+from relmm.learning.progress import Progress
+from relmm.policies.learning import LearningConfig, LearningPolicy
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.locobot_sim import LocobotSim
 
@@ -77,6 +81,7 @@ class RecordConfig:
         robot: `--robot.type=locobot_sim --robot.room=...`.
         dataset: where the episodes go.
         policy: who acts.
+        curriculum: of `practice`, by a policy that is learning elsewhere; `none` for none.
         mode: `practice`: what is picked up is put down elsewhere, an episode ends with it, and there are no resets, to
             learn to grasp from; `clean`: an episode is one room that is cleaned into the basket, to imitate.
         seed: of everything random; the same seed records the same dataset.
@@ -88,6 +93,7 @@ class RecordConfig:
     robot: RobotConfig
     dataset: RecordDatasetConfig
     policy: PreTrainedConfig | None = None
+    curriculum: CurriculumConfig = field(default_factory=lambda: CurriculumConfig("none"))
     mode: str = "practice"
     seed: int = 0
     resume: bool = False
@@ -99,6 +105,11 @@ class RecordConfig:
         check_camera(self.policy, "robot.camera", self.robot)
         if self.mode not in MODES:
             raise ConfigError(f"mode is {self.mode!r}, but must be one of {', '.join(MODES)}.")
+        if self.curriculum.type != "none" and not (isinstance(self.policy, LearningConfig) and self.mode == "practice"):
+            raise ConfigError(
+                f"curriculum.type is {self.curriculum.type!r}, which is for --mode=practice and a policy that learns: "
+                "say --policy.path of a run of relmm-train, or leave it out."
+            )
         check_range("seed", self.seed, 0, MAX_SEED)
         check_range("max_steps", self.max_steps, 1, MAX_STEPS)
         check_range("pseudo_reset_steps", self.pseudo_reset_steps, 0, MAX_STEPS)
@@ -166,14 +177,15 @@ def _collect(
     seed: int,
     signals: StopOnSignal,
 ) -> None:
-    collector = _collector(config, robot, actor, recorder, seed, lambda: signals.stopped)
     assert config.policy is not None
+    collector, life = _collector(config, robot, actor, recorder, seed, lambda: signals.stopped)
     fresh = FreshWeights(actor, config.policy.pretrained_path)
     frames = successes = grasps = 0
     with progress(config.dataset.num_episodes, "episode") as bar:
         while bar.n < config.dataset.num_episodes and not signals.stopped:
             if (checkpoint := fresh.take()) is not None:
                 bar.write(f"acting by {checkpoint}")
+            life.weights_step = fresh.step
             result = collector.episode()
             frames, grasps, successes = frames + result.frames, grasps + result.grasps, successes + result.picked_up
             bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, refresh=False)
@@ -187,21 +199,46 @@ def _collector(
     recorder: EpisodeRecorder,
     seed: int,
     should_stop: Callable[[], bool],
-) -> Collector | Cleaner:
+) -> tuple[Collector | Practice | Cleaner, Life]:
     practice = config.mode == "practice"
     to_collect = None if practice else robot.body.room.num_objects if isinstance(robot, LocobotSim) else math.inf
     pause = Pause(robot, should_stop)
-    life = Life(robot, [recorder], robot.seconds, config.max_steps, pause, to_collect)
+    progress, watcher = _counted(config)
+    life = Life(robot, [recorder, progress, watcher], robot.seconds, config.max_steps, pause, to_collect)
     pause.charged = life.look_again
+    rng = np.random.default_rng([seed, _COLLECTOR_STREAM])
+    if config.curriculum.type != "none":
+        assert isinstance(actor.policy, LearningPolicy)
+        person = person_beside(robot, seed)
+        return Practice(
+            life,
+            actor.policy,
+            watcher,
+            progress,
+            curriculum=config.curriculum.type,
+            pseudo_reset_steps=config.pseudo_reset_steps,
+            rng=rng,
+            put_in_reach=(lambda: False) if person is None else person.put_in_reach,
+        ), life
     if practice:
-        return Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
+        return Collector(life, actor, rng, config.pseudo_reset_steps), life
     rooms = np.random.default_rng([seed, _ROOMS_STREAM])
 
     def set_up() -> None:
         if isinstance(robot, LocobotSim):  # else a person does it
             robot.reset(int(rooms.integers(2**31)))
 
-    return Cleaner(life, actor, set_up)
+    return Cleaner(life, actor, set_up), life
+
+
+def _counted(config: RecordConfig) -> tuple[Progress, Watcher]:
+    """What the curricula depend on, from before a resume."""
+    progress, watcher = Progress(), Watcher()
+    if config.resume and config.curriculum.type != "none":
+        for episode in read_episodes(config.dataset.folder()):
+            progress.read(episode)
+            watcher.read(episode, update=False)
+    return progress, watcher
 
 
 def main() -> None:

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, now, run
 from relmm.commands.curve import draw_learning_curve
 from relmm.commands.hub_resume import take_over_from_hub
 from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
-from relmm.commands.robots import Pause, make_locobot
+from relmm.commands.robots import Pause, make_locobot, person_beside
+from relmm.commands.rooms import Rooms
 from relmm.commands.sharing import check_uploads
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
@@ -29,12 +28,9 @@ from relmm.episodes import (
 )
 from relmm.learning.life import Life
 from relmm.learning.trainer import Trainer
+from relmm.policies.learning import LearningConfig
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.config_locobot_sim import LocobotSimConfig
-from relmm.sim.locobot_sim import LocobotSim
-from relmm.sim.person import Person
-
-_PERSON_STREAM = 4  # keeps random numbers of one seed apart
 
 
 def train(config: TrainConfig) -> None:
@@ -45,13 +41,16 @@ def train(config: TrainConfig) -> None:
     check_uploads(config)
     with StopOnSignal() as signals:
         run = Run(config, signals)
-        if config.dataset.follow is not None:
+        if config.fleet.rooms:
+            _train_in_rooms(run)
+        elif config.dataset.follow is not None:
             train_on_stream(run)
         else:
             _train_on_robot(run)
     assert config.output_dir is not None
     draw_learning_curve(config.output_dir / "metrics.jsonl", config.output_dir / "learning_curve.png")
-    kept = "checkpoints, metrics" if config.robot is None else "checkpoints, metrics, dataset"
+    recorded = "rooms" if config.fleet.rooms else "dataset" if config.robot is not None else ""
+    kept = ", ".join(filter(None, ["checkpoints", "metrics", recorded]))
     print(f"{kept} and learning_curve.png: {config.output_dir}")
     run.uploads.say = print
     run.uploads.finish()
@@ -74,7 +73,7 @@ def _train_on_robot(run: Run) -> None:
             life = Life(
                 robot, [recorder, run.learner, run.progress], robot.seconds, config.max_steps, should_stop=pause
             )
-            person = _person(robot, seed)
+            person = person_beside(robot, seed)
 
             def charged() -> None:
                 run.progress.interventions += 1
@@ -103,6 +102,21 @@ def _train_on_robot(run: Run) -> None:
                 run.session(save, _evaluation(run, bar), bar).live(trainer, lambda: run.signals.stopped)
     if recorder.saved_episodes > 0:
         print(summarize(config.dataset_root))
+
+
+def _train_in_rooms(run: Run) -> None:
+    config = run.config
+    assert isinstance(config.policy, LearningConfig)
+    shares = {name: -(-getattr(config.policy, name) // config.fleet.rooms) for name in ("num_stationary", "num_max")}
+    options = [
+        *(f"--policy.{name}={share}" for name, share in shares.items()),
+        *("--policy.sample=true", "--policy.device=cpu", f"--curriculum.type={config.curriculum.type}"),
+        *(f"--{name}={getattr(config, name)}" for name in ("max_steps", "pseudo_reset_steps")),
+    ]
+    policy = config.checkpoints / "last" / "pretrained_model"
+    robot = run.saved_config["robot"]
+    with Rooms(config.followed[0], robot, policy, config.fleet.rooms, config.seed, options) as rooms:
+        train_on_stream(run, lambda bar: rooms.watch(bar.write), lambda bar: _evaluation(run, bar), lambda: str(rooms))
 
 
 def _own_dataset(run: Run) -> tuple[int, bool]:
@@ -135,11 +149,6 @@ def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:
         robot_type=robot.name,
         info={**info, "seed": seed, "started": now(), "policy": run.policy.name, "curriculum": config.curriculum.type},
     )
-
-
-def _person(robot: LocobotRobot, seed: int) -> Person | None:
-    """Beside a simulated robot; nobody helps a real one unasked."""
-    return Person(robot, np.random.default_rng([seed, _PERSON_STREAM])) if isinstance(robot, LocobotSim) else None
 
 
 def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:

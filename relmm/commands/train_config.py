@@ -80,6 +80,21 @@ class HubConfig:
 
 
 @dataclass
+class TrainFleetConfig:
+    """Several rooms at once.
+
+    Args:
+        rooms: simulated rooms that record at the same time, a process each, for one learner; 0 for the robot in this
+            process. Their datasets are in `rooms/` of the output folder.
+    """
+
+    rooms: int = 0
+
+    def __post_init__(self) -> None:
+        check_range("fleet.rooms", self.rooms, 0, 1000)
+
+
+@dataclass
 class CurriculumConfig:
     """What comes before, or at the beginning of, learning to navigate; its numbers are in the policy's config.
 
@@ -123,6 +138,7 @@ class TrainConfig:
         robot: `--robot.type=locobot_sim --robot.room=...`; not with `--dataset.follow`.
         dataset: where the robot's life is kept, and what is learned from besides.
         policy: `--policy.type=relmm` and its hyper-parameters, or `--policy.path` to go on from.
+        fleet: several rooms at once.
         curriculum: `--curriculum.type=stationary`, `autonomous` or `none`.
         eval: evaluation while training.
         hub: when to upload; what, is said with `--policy.push_to_hub`, `--policy.repo_id`, `--dataset.push_to_hub`.
@@ -144,6 +160,7 @@ class TrainConfig:
     robot: RobotConfig | None = None
     dataset: TrainDatasetConfig = field(default_factory=TrainDatasetConfig)
     policy: PreTrainedConfig | None = field(default=None, metadata={"choices": LearningConfig})
+    fleet: TrainFleetConfig = field(default_factory=TrainFleetConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
     hub: HubConfig = field(default_factory=HubConfig)
@@ -179,11 +196,26 @@ class TrainConfig:
                 "Say what to learn from: either a robot (--robot.type=locobot_sim) or datasets that other processes "
                 "record (--dataset.follow=FOLDER,FOLDER,...), not both."
             )
+        self._check_rooms()
         check_camera(self.policy, "robot.camera", self.robot)
         if self.policy.seed is None:
             self.policy.seed = self.seed
         self._check_uploads()
         self._choose_folder()
+
+    def _check_rooms(self) -> None:
+        if not self.fleet.rooms:
+            return
+        if self.robot is None or self.robot.type != "locobot_sim":
+            raise ConfigError(
+                f"fleet.rooms is {self.fleet.rooms}, and only a simulated robot can be in several rooms: say "
+                "--robot.type=locobot_sim, or leave out --fleet.rooms."
+            )
+        if self.dataset.root is not None or self.dataset.push_to_hub:
+            raise ConfigError(
+                "With --fleet.rooms each room has a dataset of its own in rooms/ of the output folder: leave out "
+                "--dataset.root and --dataset.push_to_hub, and upload them with relmm-upload."
+            )
 
     def _check_uploads(self) -> None:
         policy = self.policy
@@ -214,7 +246,10 @@ class TrainConfig:
 
     @property
     def followed(self) -> list[Path]:
-        """The datasets, and folders of datasets, of others that are learned from."""
+        """The datasets, and folders of datasets, that other processes record and this one learns from."""
+        if self.fleet.rooms:
+            assert self.output_dir is not None
+            return [self.output_dir / "rooms"]
         return [] if self.dataset.follow is None else [Path(name) for name in self.dataset.follow.split(",")]
 
     @property

@@ -119,8 +119,8 @@ class Run:
                 episodes = episode.index + 1
         return episodes
 
-    def save(self, episodes: int, runs: list[dict[str, Any]] | None = None, sources: Sequence[Cursor] = ()) -> None:
-        """Write a checkpoint.
+    def save(self, episodes: int, runs: list[dict[str, Any]] | None = None, sources: Sequence[Cursor] = ()) -> Path:
+        """Write a checkpoint; its folder.
 
         Args:
             episodes: that the weights have learned from, of the run's dataset or of those of others; a resumed run
@@ -129,7 +129,7 @@ class Run:
             sources: how far each dataset of others has been learned from.
         """
         counters = {"episodes": episodes, "interventions": self.progress.interventions}
-        save_checkpoint(
+        return save_checkpoint(
             self.config.checkpoints,
             self.progress.steps,
             self.actor,

@@ -39,12 +39,12 @@ class Intake:
         self._ages: list[int] = []
         self._updates = self._all_updates()
 
-    def take(self, episode: Episode, source: str) -> None:
+    def take(self, source: str, episode: Episode) -> None:
         """Learn from an episode.
 
         Args:
+            source: the dataset it is of, which has a clock of its own.
             episode: whole.
-            source: its dataset, which has a clock of its own.
         """
         if episode.weights_step >= 0:
             self._ages.append(max(self._progress.steps - episode.weights_step, 0))
@@ -59,9 +59,12 @@ class Intake:
         """Whether those who act should get newer weights now."""
         return self._clock() - self._saved_at >= self._saving_s * (1 / _SAVING_SHARE - 1)
 
-    def saved(self, seconds: float) -> None:
-        """Note that weights were saved just now, and how long that took."""
-        self._saved_at, self._saving_s = self._clock(), seconds
+    def timed(self, save: Callable[[], None]) -> None:
+        """Save weights, and note how long that takes."""
+        started = self._clock()
+        save()
+        self._saved_at = self._clock()
+        self._saving_s = self._saved_at - started
 
     def logs(self) -> dict[str, float]:
         """For a line of the metrics: what came since the last one, and how far behind the learner is."""

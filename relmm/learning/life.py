@@ -85,6 +85,7 @@ class Life:
         pose: x, y (m) and heading (rad, not wrapped) by the robot's own wheels since this life began.
         episode: what has happened in the running episode.
         succeeded: whether the last step picked something up.
+        episodes_ended: how many; the result of the newest is in `last_episode`.
         weights_step: steps of the learner elsewhere whose weights act, -1 without one.
     """
 
@@ -105,7 +106,7 @@ class Life:
         self.pose: FloatArray = np.zeros(3)
         self.episode = EpisodeResult()
         self.succeeded = False
-        self.weights_step = -1
+        self.episodes_ended, self.weights_step = 0, -1
 
     @property
     def holding(self) -> bool:
@@ -183,6 +184,7 @@ class Life:
     def _begin_episode(self, success: bool) -> None:
         self.episode.success = success
         self.last_episode, self.episode = self.episode, EpisodeResult()
+        self.episodes_ended += 1
         self._grasps_since_drive = 0
 
 

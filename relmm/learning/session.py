@@ -82,22 +82,26 @@ class Session:
             self._after(before)
         self._end()
 
-    def follow(self, episodes: Iterable[tuple[str, Episode]], intake: Intake) -> None:
+    def follow(self, episodes: Iterable[tuple[str, Episode] | None], intake: Intake) -> None:
         """Train on episodes that come in from elsewhere, until the last step or the last of them.
 
         Args:
-            episodes: with the dataset that each is of.
+            episodes: with the dataset that each is of; None where there is none for the moment.
             intake: takes them, and tells how well it keeps up.
         """
         self._begin()
         self._more_logs = intake.logs
-        for source, episode in episodes:
-            before = self._progress.steps
-            intake.take(episode, source)
-            saved_at, started = self._saved_at, time.monotonic()
+        for arrival in episodes:
+            if arrival is None:
+                if intake.weights_are_due:
+                    self._checkpoint()
+                continue
+            before, practised = self._progress.steps, self._progress.practice_attempts
+            intake.take(*arrival)
+            self._saved_at = -1  # what was saved at this step has not learned from this episode
             self._after(before, save=intake.weights_are_due)
-            if self._saved_at != saved_at:
-                intake.saved(time.monotonic() - started)
+            if _passed(practised, self._progress.practice_attempts, _PRACTICE_LOG_FREQ):
+                self._log()
             if self._progress.steps >= self._schedule.steps:
                 break
         self._end()
