@@ -6,13 +6,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
+from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, now, progress, run
+from relmm.commands.fleet import RecordFleetConfig, act_by_newest_weights, linked, weights_folder
 from relmm.commands.policies import FreshWeights, check_camera, make_actor, policy_from_path, take_seed
 from relmm.commands.robots import Pause, make_locobot, person_beside
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
@@ -36,6 +39,9 @@ from relmm.learning.progress import Progress
 from relmm.policies.learning import LearningConfig, LearningPolicy
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.locobot_sim import LocobotSim
+
+if TYPE_CHECKING:
+    from relmm.fleet.client import Link
 
 # Keep the random numbers of the pseudo-resets and of the rooms apart from others drawn from the same seed.
 _COLLECTOR_STREAM, _ROOMS_STREAM = 2, 3
@@ -81,6 +87,7 @@ class RecordConfig:
         robot: `--robot.type=locobot_sim --robot.room=...`.
         dataset: where the episodes go.
         policy: who acts.
+        fleet: the server of a fleet, if there is one.
         curriculum: of `practice`, by a policy that is learning elsewhere; `none` for none.
         mode: `practice`: what is picked up is put down elsewhere, an episode ends with it, and there are no resets, to
             learn to grasp from; `clean`: an episode is one room that is cleaned into the basket, to imitate.
@@ -93,6 +100,7 @@ class RecordConfig:
     robot: RobotConfig
     dataset: RecordDatasetConfig
     policy: PreTrainedConfig | None = None
+    fleet: RecordFleetConfig = field(default_factory=RecordFleetConfig)
     curriculum: CurriculumConfig = field(default_factory=lambda: CurriculumConfig("none"))
     mode: str = "practice"
     seed: int = 0
@@ -140,10 +148,17 @@ def record(config: RecordConfig) -> None:
     assert config.policy is not None
     actor = make_actor(config.policy)
     robot = make_locobot(config.robot, seed, "relmm-record")
+    followed = weights_folder(root) / "last" / "pretrained_model" == config.policy.pretrained_path
     with StopOnSignal() as signals, robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
-        with _recorder(config, root, robot) as recorder:
-            _collect(config, robot, actor, recorder, seed, signals)
+        with (
+            _recorder(config, root, robot) as recorder,
+            linked(config.fleet, root, config.dataset.repo_id, followed) as link,
+        ):
+            _collect(config, robot, actor, recorder, seed, signals, link)
+            recorder.close()
+            if link is not None and (left := link.finish()):
+                print(f"{left} episodes are not sent yet: --resume=true sends them. {link.problem}")
     if recorder.saved_episodes == 0:
         print(f"no episode was recorded; --resume=true goes on in {root}")
         return
@@ -176,11 +191,13 @@ def _collect(
     recorder: EpisodeRecorder,
     seed: int,
     signals: StopOnSignal,
+    link: Link | None,
 ) -> None:
     assert config.policy is not None
     collector, life = _collector(config, robot, actor, recorder, seed, lambda: signals.stopped)
     fresh = FreshWeights(actor, config.policy.pretrained_path)
     frames = successes = grasps = 0
+    said = ""
     with progress(config.dataset.num_episodes, "episode") as bar:
         while bar.n < config.dataset.num_episodes and not signals.stopped:
             if (checkpoint := fresh.take()) is not None:
@@ -188,7 +205,11 @@ def _collect(
             life.weights_step = fresh.step
             result = collector.episode()
             frames, grasps, successes = frames + result.frames, grasps + result.grasps, successes + result.picked_up
-            bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, refresh=False)
+            sending = {"unsent": link.waiting} if link is not None else {}
+            bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, **sending, refresh=False)
+            if link is not None and link.problem != said:
+                said = link.problem
+                bar.write(said or "the server can be reached again")
             bar.update()
 
 
@@ -243,7 +264,15 @@ def _counted(config: RecordConfig) -> tuple[Progress, Watcher]:
 
 def main() -> None:
     """Entry point of `relmm-record`."""
-    run("relmm-record", RecordConfig, record)
+    run("relmm-record", RecordConfig, record, prepare=_prepare)
+
+
+def _prepare(arguments: Arguments) -> None:
+    has_policy = any(arguments.get(f"policy.{name}") is not None for name in ("type", "path"))
+    repo_id, root = arguments.get("dataset.repo_id"), arguments.get("dataset.root")
+    if arguments.get("fleet.server") is not None and not has_policy and repo_id is not None:
+        settings = RecordDatasetConfig(repo_id, None if root is None else Path(root))
+        act_by_newest_weights(arguments, settings.folder())
 
 
 if __name__ == "__main__":
