@@ -197,6 +197,14 @@ class EpisodeFollower(RowFollower):
             self.next += 1
             yield episode
 
+    def read_row(self, row: dict[str, Any]) -> Episode | None:
+        """The episode of a row of meta/episodes, whatever its number; None when its file does not hold it whole.
+
+        Raises:
+            DatasetError: as `poll`.
+        """
+        return None if self._data is None else _DataFiles(self._folder, self._data).read(row)
+
     def _find_data(self) -> _Layout | None:
         info = self._folder.read_json(INFO)
         if info is None:

@@ -18,7 +18,7 @@ from relmm.episodes.info import DATA_PATH, are_features, runs_of
 from relmm.episodes.parquet import read_table
 from relmm.episodes.repair import verify_and_repair
 from relmm.episodes.settings import feature_differences
-from relmm.episodes.survey import PLACE_COLUMNS, read_places
+from relmm.episodes.survey import PLACE_COLUMNS, are_places
 from relmm.errors import DatasetError, FleetError
 from relmm.features import DEPTH_KEY, FPS, dataset_features
 from relmm.fleet.wire import MAX_EPISODE_BYTES, LinkError, RestartError, number, unpack
@@ -77,6 +77,7 @@ class Mirror:
         self.episodes = self._frames = 0
         self._tasks: list[str] = []
         self._schema: pa.Schema | None = None
+        self._reader: EpisodeFollower | None = None  # of what is staged
         self._partial: _Partial | None = None
 
     def open(self, dataset: dict[str, Any]) -> None:
@@ -170,7 +171,7 @@ class Mirror:
 
     def _stage(self, content: bytes) -> None:
         """Write the episode as a dataset of its own, read it as a learner would, and publish its files."""
-        staging, staged = self._folder.staging, DatasetFolder(self._folder.staging)
+        staging = self._folder.staging
         place = dict(zip(("chunk_index", "file_index"), divmod(self.episodes, _FILES_IN_CHUNK), strict=True))
         data, listed = DATA_PATH.format(**place), _LIST_PATH.format(**place)
         header, body = unpack(content)
@@ -178,35 +179,35 @@ class Mirror:
         for name, part in ((data, body[:length]), (listed, body[length:])):
             (staging / name).parent.mkdir(parents=True)
             (staging / name).write_bytes(part)
-        shutil.copyfile(self._folder.root / INFO, staging / INFO)
-        row = self._write_again(staging / data, staging / listed, place)
-        tasks = self._tasks_with(row["tasks"], read_table(staging / data, ["task_index"]))
-        follower = EpisodeFollower(staging, self.episodes, self._camera)
-        if len(list(follower.read_new())) != 1 or follower.problem:
-            raise DatasetError(follower.problem or "it holds no episode")
-        self._publish(staged, [data, listed], row["length"], tasks)
+        row, frames = self._write_again(staging / data, staging / listed, place)
+        if self._reader is None:
+            shutil.copyfile(self._folder.root / INFO, staging / INFO)
+            self._reader = EpisodeFollower(staging, camera=self._camera)
+        if self._reader.read_row(row) is None:
+            raise DatasetError("its frames are not those that its row of the list tells of")
+        self._publish(staging, [data, listed], row["length"], self._tasks_with(row["tasks"], frames))
 
-    def _write_again(self, data: Path, listed: Path, place: dict[str, int]) -> dict[str, Any]:
-        """Both files with nothing in them but the columns that they must have; the row of the list."""
-        rows = read_places(listed)
-        if rows is None or len(rows) != 1 or rows["dataset_from_index"][0].as_py() != self._frames:
+    def _write_again(self, data: Path, listed: Path, place: dict[str, int]) -> tuple[dict[str, Any], pa.Table]:
+        """Both files with nothing in them but the columns that they must have; the row of the list, and the frames."""
+        rows, frames = read_table(listed), read_table(data)
+        known = [name for name in rows.column_names if name in _LIST_COLUMNS or name.startswith("stats/")]
+        if len(rows) != 1 or not are_places(rows) or not set(_LIST_COLUMNS) <= set(known):
+            raise DatasetError("its row of the list of episodes is none")
+        rows = rows.select(known)
+        for kind in ("data", "meta/episodes"):
+            for name, value in place.items():
+                at = rows.column_names.index(f"{kind}/{name}")
+                rows = rows.set_column(at, f"{kind}/{name}", pa.array([value], pa.int64()))
+        row: dict[str, Any] = rows.select(PLACE_COLUMNS).to_pylist()[0]
+        if (row["episode_index"], row["dataset_from_index"]) != (self.episodes, self._frames):
             raise DatasetError("its row of the list of episodes does not follow on")
-        row: dict[str, Any] = rows.to_pylist()[0]
-        table = read_table(listed)
-        known = [name for name in table.column_names if name in _LIST_COLUMNS or name.startswith("stats/")]
-        values = {f"{kind}/{name}": number for kind in ("data", "meta/episodes") for name, number in place.items()}
-        table = table.select(known)
-        for name, value in values.items():
-            table = table.set_column(table.column_names.index(name), name, pa.array([value], pa.int64()))
-        pq.write_table(table, listed)
-        frames = read_table(data)
         assert self._schema is not None
         if set(frames.column_names) != set(self._schema.names) or len(frames) != row["length"]:
             raise DatasetError("its frames have other columns, or another number, than it says")
-        pq.write_table(
-            frames.select(self._schema.names).cast(self._schema), data, compression="snappy", use_dictionary=True
-        )
-        return row
+        frames = frames.select(self._schema.names).cast(self._schema)
+        pq.write_table(rows, listed)
+        pq.write_table(frames, data, compression="snappy", use_dictionary=True)
+        return row, frames
 
     def _tasks_with(self, names: list[str], frames: pa.Table) -> list[str]:
         """The tasks of the dataset, with those of one more episode."""
@@ -218,10 +219,10 @@ class Mirror:
                 raise DatasetError(f"its task {index} is not the one that this dataset has")
         return tasks
 
-    def _publish(self, staged: DatasetFolder, names: list[str], frames: int, tasks: list[str]) -> None:
+    def _publish(self, staging: Path, names: list[str], frames: int, tasks: list[str]) -> None:
         info = self._folder.read_json(INFO)
         assert info is not None
-        self._folder.publish(staged.root, names)
+        self._folder.publish(staging, names)
         self.episodes, self._frames = self.episodes + 1, self._frames + frames
         if tasks != self._tasks:
             self._tasks = tasks
