@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _FIRST_WEIGHTS_S = 600.0  # that a robot waits for the learner's first weights
 _RETRY_S = 2.0
+_UNREACHABLE = "it cannot be reached"
 
 
 @dataclass
@@ -68,13 +69,14 @@ def act_by_newest_weights(arguments: Arguments, dataset: Path) -> None:
     options = {name: arguments.get(f"fleet.{name}") for name in ("server", "token_file", "certificate")}
     paths = {name: None if value is None else Path(value) for name, value in options.items() if name != "server"}
     config = RecordFleetConfig(options["server"], **paths)
-    folder, deadline, said = weights_folder(dataset), time.monotonic() + _FIRST_WEIGHTS_S, ""
+    folder, deadline = weights_folder(dataset), time.monotonic() + _FIRST_WEIGHTS_S
+    problem = said = ""
     with contextlib.closing(_channel(config)) as channel:
         while True:
             try:
                 problem = "" if fetch_weights(channel, folder) else "its learner has no weights yet"
             except LinkError as error:
-                problem = f"it cannot be reached ({error})"
+                problem = problem if problem.startswith(_UNREACHABLE) else f"{_UNREACHABLE} ({error})"
             there = (folder / "last").exists()
             if problem and problem != said:
                 print(f"{config.server}: {problem}; " + ("acting by the last ones" if there else "waiting"), flush=True)

@@ -63,6 +63,11 @@ class ServeConfig:
     output_dir: Path
     fleet: ServeFleetConfig = field(default_factory=ServeFleetConfig)
 
+    @property
+    def checkpoints(self) -> Path:
+        """Whose newest one the robots get."""
+        return self.output_dir / "checkpoints"
+
 
 def check_address(option: str, address: str) -> None:
     """Refuse what is no HOST:PORT.
@@ -84,7 +89,7 @@ def serve(config: ServeConfig) -> None:
     token, credentials = read_token(fleet.token_file), server_credentials(fleet.certificate, fleet.key)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))  # a connection a robot
-    server = FleetServer(config.dataset.root, config.output_dir / "checkpoints", fleet.camera)
+    server = FleetServer(config.dataset.root, config.checkpoints, fleet.camera)
     with StopOnSignal() as signals, server:
         port = server.start(fleet.listen, token, credentials)
         print(
