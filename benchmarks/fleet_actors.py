@@ -24,6 +24,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -142,7 +143,7 @@ def start_learner(folder: Path, *options: str) -> subprocess.Popen[bytes]:
     return start("train", folder / "train.log", *data, *fixed, *options)
 
 
-def wait_until(condition, seconds: float, what: str) -> None:
+def wait_until(condition: Callable[[], object], seconds: float, what: str) -> None:
     """Wait for something that must happen."""
     deadline = time.monotonic() + seconds
     while not condition():
@@ -227,7 +228,8 @@ def scale(recording: Path, actors: int, rate: float, seconds: float) -> dict[str
             processes = {"server": psutil.Process(server.pid), "learner": psutil.Process(learner.pid)}
             processes["actors"] = psutil.Process()
             before = {name: sum(process.cpu_times()[:2]) for name, process in processes.items()}
-            had, drivers.growing, began, peak, waiting = received(folder), True, time.monotonic(), {}, 0.0
+            peak: dict[str, int] = {}
+            had, drivers.growing, began, waiting = received(folder), True, time.monotonic(), 0.0
             while time.monotonic() - began < seconds:
                 time.sleep(1.0)
                 for name, process in processes.items():

@@ -3,7 +3,7 @@
 Each actor is a process with a dataset of its own, which grows by episodes of a recording, and the real client beside
 it. All reach `relmm-serve` through a proxy that is cut now and then. At the end nobody is disturbed any more, until all
 has arrived and `relmm-train` has learned from it. Then every mirror is compared with its actor's dataset, and the
-updates of the learner's optimiser with the attempts that there are: an episode learned twice, or not at all, would show.
+updates of the optimiser with the attempts that there are: an episode learned twice, or not at all, would show.
 
     python benchmarks/fleet_faults.py --recording data/replayed --actors 8 --kills 20 --learner_kills 5 --cuts 20
 """
@@ -244,7 +244,8 @@ def main() -> None:
         folder = Path(temporary)
         make_template(arguments.recording, folder / "template")
         certificate(folder)
-        port, ages, ended = free_port(), [], threading.Event()
+        ages: list[int] = []
+        port, ended = free_port(), threading.Event()
         proxy = Proxy(port)
         running = {"server": start_server(folder, port), "learner": start_learner(folder, *_LEARNER)}
         wait_until((folder / "run" / "checkpoints" / "last").exists, 200, "the learner's start")

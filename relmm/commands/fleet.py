@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relmm.commands.arguments import Arguments
-from relmm.commands.serve import check_address
+from relmm.commands.serve import check_address, check_installed
 from relmm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ class RecordFleetConfig:
     def __post_init__(self) -> None:
         if self.server is not None:
             check_address("fleet.server", self.server)
+            check_installed()
         elif self.token_file is not None or self.certificate is not None:
             raise ConfigError(
                 "fleet.token_file and fleet.certificate are for a server: also say --fleet.server=HOST:PORT."
@@ -63,12 +64,12 @@ def act_by_newest_weights(arguments: Arguments, dataset: Path) -> None:
         FleetError: the server refuses.
         ConfigError: neither it nor an earlier run has any weights.
     """
-    from relmm.fleet.client import fetch_weights
-    from relmm.fleet.wire import LinkError
-
     options = {name: arguments.get(f"fleet.{name}") for name in ("server", "token_file", "certificate")}
     paths = {name: None if value is None else Path(value) for name, value in options.items() if name != "server"}
     config = RecordFleetConfig(options["server"], **paths)
+    from relmm.fleet.client import fetch_weights
+    from relmm.fleet.wire import LinkError
+
     folder, deadline = weights_folder(dataset), time.monotonic() + _FIRST_WEIGHTS_S
     problem = said = ""
     with contextlib.closing(_channel(config)) as channel:

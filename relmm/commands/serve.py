@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import time
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 from relmm.commands.cli import StopOnSignal, progress, run
@@ -69,6 +70,16 @@ class ServeConfig:
         return self.output_dir / "checkpoints"
 
 
+def check_installed() -> None:
+    """See that there is gRPC, which only fleets need.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if find_spec("grpc") is None:
+        raise ConfigError("A fleet needs gRPC, which is not installed: pip install 'lerobot_policy_relmm[fleet]'.")
+
+
 def check_address(option: str, address: str) -> None:
     """Refuse what is no HOST:PORT.
 
@@ -82,6 +93,7 @@ def check_address(option: str, address: str) -> None:
 
 def serve(config: ServeConfig) -> None:
     """Serve until a signal."""
+    check_installed()
     from relmm.fleet.server import FleetServer
     from relmm.fleet.wire import read_token, server_credentials
 
