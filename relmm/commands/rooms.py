@@ -16,6 +16,7 @@ from typing import Any, Self
 from relmm.episodes.folder import INFO, RELMM, DatasetFolder
 from relmm.errors import MANY, MAX_SEED, FleetError
 
+_COMMAND = (sys.executable, "-m", "relmm.commands.room")
 _SEED_STEP = 1_000_003  # between rooms: a resumed recording goes on with its seed plus its episodes
 _TRIES = 3  # starts of a room without a single episode, after which something else is wrong
 _LONGEST_PAUSE_S = 30.0  # between a room's end and its next start
@@ -138,7 +139,7 @@ class _Room:
             # In a session of its own, where a Ctrl-C that is meant for the run does not reach it.
             self._process = subprocess.Popen(
                 [
-                    *(sys.executable, "-m", "relmm.commands.room"),
+                    *_COMMAND,
                     *(f"--config_path={self._root.with_suffix('.json')}", f"--dataset.num_episodes={MANY}", *options),
                 ],
                 stdin=subprocess.PIPE,

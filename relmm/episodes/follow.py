@@ -197,13 +197,21 @@ class EpisodeFollower(RowFollower):
             self.next += 1
             yield episode
 
-    def read_row(self, row: dict[str, Any]) -> Episode | None:
-        """The episode of a row of meta/episodes, whatever its number; None when its file does not hold it whole.
+    def read_frames(self, row: dict[str, Any], frames: pa.Table) -> Episode | None:
+        """An episode that is in memory, checked like any other.
+
+        Args:
+            row: of meta/episodes.
+            frames: with the columns of a data file.
+
+        Returns:
+            The episode; None when the frames are not all there.
 
         Raises:
             DatasetError: as `poll`.
         """
-        return None if self._data is None else _DataFiles(self._folder, self._data).read(row)
+        assert self._data is not None
+        return _DataFiles(self._folder, self._data).read_table(row, frames.select(self._data.columns))
 
     def _find_data(self) -> _Layout | None:
         info = self._folder.read_json(INFO)
@@ -241,9 +249,11 @@ class _DataFiles:
         if name != self._name:
             self._name = name
             self._table = read_columns(self._folder.root / name, self._layout.columns)
-            if self._table is not None and not are_whole_numbers(self._table, ["episode_index", "index"]):
-                self._table = None
-        frames = None if self._table is None else rows_of(row, self._table)
+        return None if self._table is None else self.read_table(row, self._table)
+
+    def read_table(self, row: dict[str, Any], table: pa.Table) -> Episode | None:
+        """The episode of a row; None when a table of its columns does not hold it whole."""
+        frames = rows_of(row, table) if are_whole_numbers(table, ["episode_index", "index"]) else None
         return None if frames is None else self._episode(row, frames)
 
     def _episode(self, row: dict[str, Any], frames: pa.Table) -> Episode | None:

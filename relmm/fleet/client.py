@@ -23,7 +23,7 @@ from relmm.fleet.wire import CHUNK_BYTES, MAX_WEIGHTS_BYTES, LinkError, RestartE
 
 _CALL_S = 20.0  # after which a call that nobody answers is given up
 _LOOK_S = 1.0  # between looks at the dataset
-_HEARTBEAT_S = 5.0
+_HEARTBEAT_S = 10.0
 _LONGEST_PAUSE_S = 30.0  # between attempts, after failures
 _CLOSING_S = 30.0  # that the last episodes may take
 

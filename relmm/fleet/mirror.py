@@ -160,14 +160,13 @@ class Mirror:
         what = f"episode {self.episodes} of {self._name}"
         if content is None:
             raise RestartError(f"{what} has been damaged on its way; send it again.")
-        shutil.rmtree(self._folder.staging, ignore_errors=True)
         try:
             self._stage(content)
         except (DatasetError, OSError, LookupError, TypeError, ValueError, pa.ArrowException) as error:
+            shutil.rmtree(self._folder.staging, ignore_errors=True)
+            self._reader = None
             words = " ".join(str(error).replace(str(self._folder.staging), self._name).split())
             raise FleetError(f"{what} is not what relmm records ({words}).") from error
-        finally:
-            shutil.rmtree(self._folder.staging, ignore_errors=True)
 
     def _stage(self, content: bytes) -> None:
         """Write the episode as a dataset of its own, read it as a learner would, and publish its files."""
@@ -177,18 +176,18 @@ class Mirror:
         header, body = unpack(content)
         length = number(header, "data", len(body))
         for name, part in ((data, body[:length]), (listed, body[length:])):
-            (staging / name).parent.mkdir(parents=True)
+            (staging / name).parent.mkdir(parents=True, exist_ok=True)
             (staging / name).write_bytes(part)
         row, frames = self._write_again(staging / data, staging / listed, place)
         if self._reader is None:
             shutil.copyfile(self._folder.root / INFO, staging / INFO)
             self._reader = EpisodeFollower(staging, camera=self._camera)
-        if self._reader.read_row(row) is None:
+        if self._reader.read_frames(row, frames) is None:
             raise DatasetError("its frames are not those that its row of the list tells of")
         self._publish(staging, [data, listed], row["length"], self._tasks_with(row["tasks"], frames))
 
     def _write_again(self, data: Path, listed: Path, place: dict[str, int]) -> tuple[dict[str, Any], pa.Table]:
-        """Both files with nothing in them but the columns that they must have; the row of the list, and the frames."""
+        """Both files with the columns that they must have, and no others; the row of the list, and the frames."""
         rows, frames = read_table(listed), read_table(data)
         known = [name for name in rows.column_names if name in _LIST_COLUMNS or name.startswith("stats/")]
         if len(rows) != 1 or not are_places(rows) or not set(_LIST_COLUMNS) <= set(known):
@@ -204,9 +203,10 @@ class Mirror:
         assert self._schema is not None
         if set(frames.column_names) != set(self._schema.names) or len(frames) != row["length"]:
             raise DatasetError("its frames have other columns, or another number, than it says")
-        frames = frames.select(self._schema.names).cast(self._schema)
         pq.write_table(rows, listed)
-        pq.write_table(frames, data, compression="snappy", use_dictionary=True)
+        if not frames.schema.equals(self._schema) or frames.schema.metadata != self._schema.metadata:
+            frames = frames.select(self._schema.names).cast(self._schema)
+            pq.write_table(frames, data, compression="snappy", use_dictionary=True)
         return row, frames
 
     def _tasks_with(self, names: list[str], frames: pa.Table) -> list[str]:

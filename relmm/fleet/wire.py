@@ -175,7 +175,7 @@ def call(channel: grpc.Channel, name: str, header: dict[str, Any], body: bytes, 
     except grpc.RpcError as error:
         words = " ".join((error.details() or "").split())
         if error.code() in _PASSING:
-            raise LinkError(words or error.code().name.lower()) from error
+            raise LinkError(words.rsplit(": ", 1)[-1] or error.code().name.lower()) from error
         if error.code() is grpc.StatusCode.ABORTED:
             raise RestartError(words) from error
         raise FleetError(words or f"the server has refused ({error.code().name.lower()}).") from error
