@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -47,6 +48,7 @@ class Source:
         learned: episodes that an earlier run has learned from.
         follower: reads it.
         waiting: episodes that were saved and not read, when it was last looked at.
+        runs: with what it was recorded, likewise.
 
     Raises:
         DatasetError: it exists, and is none that relmm can train on.
@@ -55,14 +57,10 @@ class Source:
     def __init__(self, root: Path, camera: str | None) -> None:
         self.root, self.learned, self.waiting = root, 0, 0
         self.follower = EpisodeFollower(root, 0, camera)
+        self.runs = recorded_runs(DatasetFolder(root))
         self._seen: tuple[float, ...] = ()  # when files were added, before it was read to the end
         self._looking: tuple[float, ...] = ()  # likewise, before it was last looked at
         self._looked = 0.0
-
-    @property
-    def runs(self) -> list[dict[str, Any]]:
-        """With what it was recorded."""
-        return recorded_runs(DatasetFolder(self.root))
 
     @property
     def cursor(self) -> Cursor:
@@ -75,6 +73,7 @@ class Source:
         if times == self._seen and not self.follower.problem and max(times, default=0.0) < self._looked - _SETTLED_S:
             return False
         self._looking, self._looked = times, time.time()
+        self.runs = recorded_runs(DatasetFolder(self.root))
         info = DatasetFolder(self.root).read_json(INFO) or {}
         total = info.get("total_episodes")
         self.waiting = max(total - self.follower.next, 0) if isinstance(total, int) else 0
@@ -107,7 +106,6 @@ class Sources:
         learned: cursors of an earlier run.
 
     Attributes:
-        all: those that were found so far, in that order.
         problems: by folder, why a dataset in a folder of datasets is left out, or is not read any further for now.
 
     Raises:
@@ -116,10 +114,16 @@ class Sources:
 
     def __init__(self, places: Sequence[Path], camera: str | None, learned: Sequence[Cursor] = ()) -> None:
         self._places, self._camera, self._cursors = places, camera, list(learned)
-        self.all: list[Source] = []
+        self._by_root: dict[Path, Source] = {}
+        self._by_recording: dict[str, Source] = {}  # by the first run
         self.problems: dict[Path, str] = {}
         self._left_out: set[Path] = set()
         self.find()
+
+    @property
+    def all(self) -> list[Source]:
+        """Those that were found so far, in that order."""
+        return list(self._by_root.values())
 
     @property
     def missing(self) -> list[Cursor]:
@@ -187,19 +191,18 @@ class Sources:
         self.problems[root] = str(error)
 
     def _add(self, root: Path) -> None:
-        if root in self._left_out or any(source.root == root for source in self.all):
+        if root in self._left_out or root in self._by_root:
             return
         source = Source(root, self._camera)
-        runs, name = source.runs, str(root.absolute())
-        for other in self.all:
-            if runs and other.runs[:1] == runs[:1]:
-                raise DatasetError(
-                    f"{root} and {other.root} hold the same recording, and each episode is learned from once; "
-                    "leave one of them out."
-                )
-        self.all.append(source)
+        recording = json.dumps(source.runs[:1], sort_keys=True) if source.runs else str(root)
+        if recording in self._by_recording:
+            raise DatasetError(
+                f"{root} and {self._by_recording[recording].root} hold the same recording, and each episode is learned "
+                "from once; leave one of them out."
+            )
+        self._by_root[root] = self._by_recording[recording] = source
         for cursor in self._cursors:
-            if cursor.is_of(name, runs) and saved_episodes(root) >= cursor.episodes:
+            if cursor.is_of(str(root.absolute()), source.runs) and saved_episodes(root) >= cursor.episodes:
                 source.learned = cursor.episodes
                 self._cursors.remove(cursor)
                 break
