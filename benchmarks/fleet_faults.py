@@ -45,7 +45,6 @@ from relmm.fleet.wire import open_channel
 
 _LEARNER = ["--policy.updates=1", "--policy.batch_size=8", "--dataset.max_waiting=1000000"]
 _MIN_ATTEMPTS = 8  # policy.min_attempts_to_update
-_PERIOD_S = 2.0  # between episodes of an actor
 
 
 class Proxy:
@@ -99,22 +98,22 @@ def _forward(source: socket.socket, target: socket.socket) -> None:
             each.shutdown(socket.SHUT_RDWR)
 
 
-def act(folder: Path, name: str, port: int) -> None:
-    """An actor: record and send until killed."""
+def act(folder: Path, name: str, port: int, period: float) -> None:
+    """An actor: record an episode every `period` s on average, and send it, until killed."""
     robot = Robot(folder / "actors" / name, folder / "template")
     channel = open_channel(f"localhost:{port}", TOKEN, folder / "server.pem")
     with Link(channel, robot.folder.root, f"me/{name}", folder / "actors" / f"{name}_policy"):
         while True:
             if not robot.is_full:
                 robot.grow()
-            time.sleep(random.uniform(0.5, 1.5) * _PERIOD_S)
+            time.sleep(random.uniform(0.5, 1.5) * period)
 
 
 class Actors:
     """The processes of all actors."""
 
-    def __init__(self, folder: Path, count: int, port: int) -> None:
-        self._folder, self._port = folder, port
+    def __init__(self, folder: Path, count: int, port: int, period: float) -> None:
+        self._folder, self._port, self._period = folder, port, period
         self.names = [f"r{n}" for n in range(count)]
         self.processes = {name: self._start(name) for name in self.names}
 
@@ -231,14 +230,15 @@ def main() -> None:
     parser.add_argument("--learner_kills", type=int, default=5)
     parser.add_argument("--server_kills", type=int, default=5)
     parser.add_argument("--cuts", type=int, default=20)
-    parser.add_argument("--pause", type=float, default=2.0, help="s between disturbances, on average")
+    parser.add_argument("--pause", type=float, default=10.0, help="s between disturbances, on average")
+    parser.add_argument("--period", type=float, default=10.0, help="s between episodes of an actor, on average")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--act")
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--port", type=int)
     arguments = parser.parse_args()
     if arguments.act:
-        act(arguments.folder, arguments.act, arguments.port)
+        act(arguments.folder, arguments.act, arguments.port, arguments.period)
         return
     with tempfile.TemporaryDirectory(prefix="relmm-faults-") as temporary:
         folder = Path(temporary)
@@ -249,7 +249,7 @@ def main() -> None:
         proxy = Proxy(port)
         running = {"server": start_server(folder, port), "learner": start_learner(folder, *_LEARNER)}
         wait_until((folder / "run" / "checkpoints" / "last").exists, 200, "the learner's start")
-        actors = Actors(folder, arguments.actors, proxy.port)
+        actors = Actors(folder, arguments.actors, proxy.port, arguments.period)
         try:
             watcher = threading.Thread(target=watch_ages, args=(folder, actors.names, ages, ended))
             watcher.start()

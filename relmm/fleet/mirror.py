@@ -192,7 +192,7 @@ class Mirror:
         known = [name for name in rows.column_names if name in _LIST_COLUMNS or name.startswith("stats/")]
         if len(rows) != 1 or not are_places(rows) or not set(_LIST_COLUMNS) <= set(known):
             raise DatasetError("its row of the list of episodes is none")
-        rows = rows.select(known)
+        sent, rows = rows, rows.select(known)
         for kind in ("data", "meta/episodes"):
             for name, value in place.items():
                 at = rows.column_names.index(f"{kind}/{name}")
@@ -203,7 +203,8 @@ class Mirror:
         assert self._schema is not None
         if set(frames.column_names) != set(self._schema.names) or len(frames) != row["length"]:
             raise DatasetError("its frames have other columns, or another number, than it says")
-        pq.write_table(rows, listed)
+        if not rows.equals(sent):  # as of a robot that has packed its files
+            pq.write_table(rows, listed)
         if not frames.schema.equals(self._schema) or frames.schema.metadata != self._schema.metadata:
             frames = frames.select(self._schema.names).cast(self._schema)
             pq.write_table(frames, data, compression="snappy", use_dictionary=True)
