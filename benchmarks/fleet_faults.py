@@ -128,6 +128,8 @@ class Actors:
                 str(self._folder),
                 "--port",
                 str(self._port),
+                "--period",
+                str(self._period),
             ]
             return subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
