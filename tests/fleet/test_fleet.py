@@ -70,7 +70,7 @@ def test_the_mirror_is_the_robots_dataset(serve, connect, robot, mirror):
 def test_a_link_that_is_cut_at_any_message_loses_and_repeats_nothing(
     serve, connect, robot, tmp_path, monkeypatch, answers
 ):
-    monkeypatch.setattr("relmm.fleet.client.CHUNK_BYTES", 5000)  # several for an episode
+    monkeypatch.setattr("relmm.fleet.client.CHUNK_BYTES", 100_000)  # three for an episode
     sent, left, cuts = wire.call, 0, 0
 
     def cut_off(*message):
@@ -84,7 +84,7 @@ def test_a_link_that_is_cut_at_any_message_loses_and_repeats_nothing(
 
     monkeypatch.setattr("relmm.fleet.client.call", cut_off)
     server = serve()
-    channel, total = connect(server), 12
+    channel, total = connect(server), 9
     for message in range(1, total):
         left = message
         link = Link(channel, robot, f"me/d{message}", None)
