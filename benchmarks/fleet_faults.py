@@ -37,6 +37,7 @@ from fleet_actors import (
     wait_until,
 )
 
+import relmm.plugin  # noqa: F401  (the policies, whose weights are fetched)
 from relmm.episodes import read_episodes
 from relmm.episodes.folder import INFO
 from relmm.features import ACTION_NAMES, Skill
