@@ -14,7 +14,7 @@ import pytest
 from relmm.commands import rooms as module
 from relmm.commands.rooms import Rooms
 from relmm.episodes import saved_episodes, verify_and_repair
-from relmm.errors import FleetError
+from relmm.errors import ConfigError, FleetError
 from relmm.learning.progress import read_metrics
 
 # Stands for a recorder: says that it has begun, records an episode if it is told to, and ends as it is told to.
@@ -100,6 +100,19 @@ def test_a_room_that_does_not_end_is_killed(rooms, tmp_path, monkeypatch):
         watch(running, lambda: starts(tmp_path))
         (process,) = psutil.Process().children()
     assert not process.is_running()
+
+
+def test_rooms_are_for_simulated_robots_and_have_their_own_datasets(tmp_path):
+    from relmm.commands.train_config import TrainConfig, TrainDatasetConfig, TrainFleetConfig
+    from relmm.robot.hardware.config_locobot import LocobotConfig
+    from relmm.sim.config_locobot_sim import LocobotSimConfig
+
+    fleet, folder = TrainFleetConfig(rooms=2), tmp_path / "run"
+    with pytest.raises(ConfigError, match="only a simulated robot can be in several rooms"):
+        TrainConfig(robot=LocobotConfig(), fleet=fleet, output_dir=folder)
+    with pytest.raises(ConfigError, match=r"leave out --dataset.root"):
+        TrainConfig(robot=LocobotSimConfig(), fleet=fleet, dataset=TrainDatasetConfig(root=tmp_path), output_dir=folder)
+    assert TrainConfig(robot=LocobotSimConfig(), fleet=fleet, output_dir=folder).followed == [folder / "rooms"]
 
 
 # --- The real thing ------------------------------------------------------------------------------------------
