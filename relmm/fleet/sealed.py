@@ -70,14 +70,19 @@ class _Files:
         name = DATA_PATH.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
         try:
             frames = rows_of(row, self._table("data", name))
-            rows = self._table("list", list_name)
+            numbers = self._table("list", list_name)["episode_index"].to_pylist()
+            if frames is None or row["episode_index"] not in numbers:
+                return None
+            at = numbers.index(row["episode_index"])
+            data = self._part("data", frames)
+            return pack({"data": len(data)}, data + self._part("list", self._tables["list"][1].slice(at, 1)))
         except (OSError, pa.ArrowException):
             return None
-        numbers = rows["episode_index"].to_pylist()
-        if frames is None or row["episode_index"] not in numbers:
-            return None
-        data = _parquet(frames)
-        return pack({"data": len(data)}, data + _parquet(rows.slice(numbers.index(row["episode_index"]), 1)))
+
+    def _part(self, kind: str, rows: pa.Table) -> bytes:
+        """Some rows of the last file of a kind as parquet: the file itself where there are no others in it."""
+        name, table = self._tables[kind]
+        return (self._root / name).read_bytes() if len(rows) == len(table) else _parquet(rows)
 
     def _table(self, kind: str, name: str) -> pa.Table:
         if kind not in self._tables or self._tables[kind][0] != name:
