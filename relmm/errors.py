@@ -38,6 +38,10 @@ class RenderingError(RelmmError):
     """No usable OpenGL on this machine."""
 
 
+class FleetError(RelmmError):
+    """A room, a robot or the server of a fleet cannot do its part."""
+
+
 class DiskError(RelmmError):
     """A file cannot be written."""
 

@@ -142,6 +142,8 @@ def carried_out(commands: FloatArray, holding: NDArray[np.bool_]) -> FloatArray:
 BELIEF = ("grasp_probability", "grasp_mean", "grasp_std")
 # Where the robot was at the frame's start, by its own wheels since the run began: m, m, degrees (not wrapped).
 ODOMETRY = ("odom_x", "odom_y", "odom_heading")
+# Navigation steps that the learner had seen when it saved the weights that acted; -1 where they were nobody else's.
+WEIGHTS_STEP = "complementary_info.weights_step"
 
 
 def outcome_features() -> dict[str, dict[str, Any]]:
@@ -155,6 +157,7 @@ def outcome_features() -> dict[str, dict[str, Any]]:
         "complementary_info.phase": {"dtype": "int64", **scalar},  # a `Phase`
         **{f"complementary_info.{name}": {"dtype": "float32", **scalar} for name in (*BELIEF, *ODOMETRY)},
         "complementary_info.robot_time": {"dtype": "float32", **scalar},  # s on the robot's clock, at the frame's start
+        WEIGHTS_STEP: {"dtype": "int64", **scalar},
     }
 
 
@@ -184,6 +187,8 @@ DATASET_COLUMNS = {
     "complementary_info.odom_y": "m, likewise",
     "complementary_info.odom_heading": "degrees, likewise, not wrapped, positive = left",
     "complementary_info.robot_time": "s on the robot's clock when the frame began",
+    WEIGHTS_STEP: "navigation steps that the learner had seen when it saved the weights that acted, to tell their age; "
+    "-1 where the robot learns itself, or its policy does not change",
     "timestamp": f"s, the frame's number in its episode divided by {FPS}",
 }
 

@@ -127,7 +127,7 @@ def now() -> str:
 
 
 def progress(
-    total: int, unit: str, title: str | None = None, leave: bool = True, layout: str | None = None
+    total: int | None, unit: str, title: str | None = None, leave: bool = True, layout: str | None = None
 ) -> tqdm[NoReturn]:
     """A progress bar; where nobody watches, as in a log file, it says something every ten seconds only."""
     interval = 0.1 if sys.stderr.isatty() else 10.0

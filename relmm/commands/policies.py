@@ -15,7 +15,7 @@ from relmm.errors import ConfigError
 from relmm.features import dataset_features
 from relmm.learning.actor import Actor
 from relmm.learning.hub import fetch_policy
-from relmm.learning.untrusted import check_features, check_policy_folder, check_weights
+from relmm.learning.untrusted import WEIGHTS, check_features, check_policy_folder, check_weights
 from relmm.policies.controller import ControllerConfig
 
 
@@ -102,20 +102,43 @@ class FreshWeights:
 
     def __init__(self, actor: Actor, path: Path | None) -> None:
         self._actor, self._path = actor, path
-        self._loaded = None if path is None else path.resolve()
+        self._loaded = self._newest()
+
+    @property
+    def step(self) -> int:
+        """Navigation steps of the learner when it saved these weights; -1 where their folder does not tell."""
+        name = "" if self._loaded is None else self._loaded[0].parent.name
+        return int(name) if name.isdecimal() else -1
 
     def take(self) -> Path | None:
         """Load what is newer than the last time; the folder it is in, None if there is nothing."""
-        newest = None if self._path is None else self._path.resolve()
-        if newest is None or newest == self._loaded or not (newest / "model.safetensors").is_file():
+        newest = self._newest()
+        if newest is None or newest == self._loaded:
             return None
+        from safetensors import SafetensorError
         from safetensors.torch import load_model
 
-        check_policy_folder(newest)
-        check_weights(self._actor.policy.config, newest)
-        load_model(self._actor.policy, newest / "model.safetensors")
+        folder, _ = newest
+        try:
+            check_policy_folder(folder)
+            check_weights(self._actor.policy.config, folder)
+            load_model(self._actor.policy, folder / WEIGHTS)
+        except (ConfigError, OSError, SafetensorError):
+            if self._newest() == newest:
+                raise
+            return None  # replaced while it was read
         self._loaded = newest
-        return newest
+        return folder
+
+    def _newest(self) -> tuple[Path, int] | None:
+        """The folder, and which file of weights is in it: those of one step may be saved again."""
+        if self._path is None:
+            return None
+        folder = self._path.resolve()
+        try:
+            return folder, (folder / WEIGHTS).stat().st_ino
+        except FileNotFoundError:
+            return None
 
 
 def _check_device(asked: str | None) -> None:

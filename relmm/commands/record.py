@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.robots.config import RobotConfig
 
+from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, now, progress, run
 from relmm.commands.display import DisplayOptions, live_views
+from relmm.commands.fleet import RecordFleetConfig, act_by_newest_weights, linked, weights_folder
 from relmm.commands.policies import FreshWeights, check_camera, make_actor, policy_from_path, take_seed
-from relmm.commands.robots import Pause, make_locobot
+from relmm.commands.robots import Pause, make_locobot, person_beside
 from relmm.commands.sharing import Uploads, check_dataset_upload, dataset_arguments
+from relmm.commands.train_config import CurriculumConfig
 from relmm.commands.upload import LICENSE
 from relmm.display import LiveView
 from relmm.episodes import (
@@ -25,15 +29,21 @@ from relmm.episodes import (
     check_new,
     check_repo_id,
     check_resume,
+    read_episodes,
     summarize,
     verify_and_repair,
 )
 from relmm.errors import MANY, MAX_SEED, ConfigError, check_range
 from relmm.learning.actor import Actor
-from relmm.learning.collect import Cleaner, Collector
+from relmm.learning.collect import Cleaner, Collector, Practice, Watcher
 from relmm.learning.life import Life
+from relmm.learning.progress import Progress
+from relmm.policies.learning import LearningConfig, LearningPolicy
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.locobot_sim import LocobotSim
+
+if TYPE_CHECKING:
+    from relmm.fleet.client import Link
 
 # Keep the random numbers of the pseudo-resets and of the rooms apart from others drawn from the same seed.
 _COLLECTOR_STREAM, _ROOMS_STREAM = 2, 3
@@ -79,6 +89,8 @@ class RecordConfig(DisplayOptions):
         robot: `--robot.type=locobot_sim --robot.room=...`.
         dataset: where the episodes go.
         policy: who acts.
+        fleet: the server of a fleet, if there is one.
+        curriculum: of `practice`, by a policy that is learning elsewhere; `none` for none.
         mode: `practice`: what is picked up is put down elsewhere, an episode ends with it, and there are no resets, to
             learn to grasp from; `clean`: an episode is one room that is cleaned into the basket, to imitate.
         seed: of everything random; the same seed records the same dataset.
@@ -90,6 +102,8 @@ class RecordConfig(DisplayOptions):
     robot: RobotConfig
     dataset: RecordDatasetConfig
     policy: PreTrainedConfig | None = None
+    fleet: RecordFleetConfig = field(default_factory=RecordFleetConfig)
+    curriculum: CurriculumConfig = field(default_factory=lambda: CurriculumConfig("none"))
     mode: str = "practice"
     seed: int = 0
     resume: bool = False
@@ -102,6 +116,11 @@ class RecordConfig(DisplayOptions):
         check_camera(self.policy, "robot.camera", self.robot)
         if self.mode not in MODES:
             raise ConfigError(f"mode is {self.mode!r}, but must be one of {', '.join(MODES)}.")
+        if self.curriculum.type != "none" and not (isinstance(self.policy, LearningConfig) and self.mode == "practice"):
+            raise ConfigError(
+                f"curriculum.type is {self.curriculum.type!r}, which is for --mode=practice and a policy that learns: "
+                "say --policy.path of a run of relmm-train, or leave it out."
+            )
         check_range("seed", self.seed, 0, MAX_SEED)
         check_range("max_steps", self.max_steps, 1, MAX_STEPS)
         check_range("pseudo_reset_steps", self.pseudo_reset_steps, 0, MAX_STEPS)
@@ -132,13 +151,18 @@ def record(config: RecordConfig) -> None:
     assert config.policy is not None
     actor = make_actor(config.policy)
     robot = make_locobot(config.robot, seed, "relmm-record")
+    followed = weights_folder(root) / "last" / "pretrained_model" == config.policy.pretrained_path
     with StopOnSignal() as signals, robot:
         robot.get_observation()  # a robot that cannot see fails here, before anything is written
         with (
             live_views(config, "relmm-record", robot.config.camera, actor) as views,
             _recorder(config, root, robot) as recorder,
+            linked(config.fleet, root, config.dataset.repo_id, followed) as link,
         ):
-            _collect(config, robot, actor, recorder, views, seed, signals)
+            _collect(config, robot, actor, recorder, views, seed, signals, link)
+            recorder.close()
+            if link is not None and (left := link.finish()):
+                print(f"{left} episodes are not sent yet: --resume=true sends them. {link.problem}")
     if recorder.saved_episodes == 0:
         print(f"no episode was recorded; --resume=true goes on in {root}")
         return
@@ -172,18 +196,25 @@ def _collect(
     views: list[LiveView],
     seed: int,
     signals: StopOnSignal,
+    link: Link | None,
 ) -> None:
-    collector = _collector(config, robot, actor, recorder, views, seed, lambda: signals.stopped)
     assert config.policy is not None
+    collector, life = _collector(config, robot, actor, recorder, views, seed, lambda: signals.stopped)
     fresh = FreshWeights(actor, config.policy.pretrained_path)
     frames = successes = grasps = 0
+    said = ""
     with progress(config.dataset.num_episodes, "episode") as bar:
         while bar.n < config.dataset.num_episodes and not signals.stopped:
             if (checkpoint := fresh.take()) is not None:
                 bar.write(f"acting by {checkpoint}")
+            life.weights_step = fresh.step
             result = collector.episode()
             frames, grasps, successes = frames + result.frames, grasps + result.grasps, successes + result.picked_up
-            bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, refresh=False)
+            sending = {"unsent": link.waiting} if link is not None else {}
+            bar.set_postfix(frames=frames, grasps=grasps, picked_up=successes, **sending, refresh=False)
+            if link is not None and link.problem != said:
+                said = link.problem
+                bar.write(said or "the server can be reached again")
             bar.update()
 
 
@@ -195,14 +226,29 @@ def _collector(
     views: list[LiveView],
     seed: int,
     should_stop: Callable[[], bool],
-) -> Collector | Cleaner:
+) -> tuple[Collector | Practice | Cleaner, Life]:
     practice = config.mode == "practice"
     to_collect = None if practice else robot.body.room.num_objects if isinstance(robot, LocobotSim) else math.inf
     pause = Pause(robot, should_stop)
-    life = Life(robot, [recorder, *views], robot.seconds, config.max_steps, pause, to_collect)
+    progress, watcher = _counted(config)
+    life = Life(robot, [recorder, progress, watcher, *views], robot.seconds, config.max_steps, pause, to_collect)
     pause.charged = life.look_again
+    rng = np.random.default_rng([seed, _COLLECTOR_STREAM])
+    if config.curriculum.type != "none":
+        assert isinstance(actor.policy, LearningPolicy)
+        person = person_beside(robot, seed)
+        return Practice(
+            life,
+            actor.policy,
+            watcher,
+            progress,
+            curriculum=config.curriculum.type,
+            pseudo_reset_steps=config.pseudo_reset_steps,
+            rng=rng,
+            put_in_reach=(lambda: False) if person is None else person.put_in_reach,
+        ), life
     if practice:
-        return Collector(life, actor, np.random.default_rng([seed, _COLLECTOR_STREAM]), config.pseudo_reset_steps)
+        return Collector(life, actor, rng, config.pseudo_reset_steps), life
     rooms = np.random.default_rng([seed, _ROOMS_STREAM])
 
     def set_up() -> None:
@@ -211,12 +257,30 @@ def _collector(
         for view in views:
             view.begin_anew()
 
-    return Cleaner(life, actor, set_up)
+    return Cleaner(life, actor, set_up), life
+
+
+def _counted(config: RecordConfig) -> tuple[Progress, Watcher]:
+    """What the curricula depend on, from before a resume."""
+    progress, watcher = Progress(), Watcher()
+    if config.resume and config.curriculum.type != "none":
+        for episode in read_episodes(config.dataset.folder()):
+            progress.read(episode)
+            watcher.read(episode, update=False)
+    return progress, watcher
 
 
 def main() -> None:
     """Entry point of `relmm-record`."""
-    run("relmm-record", RecordConfig, record)
+    run("relmm-record", RecordConfig, record, prepare=_prepare)
+
+
+def _prepare(arguments: Arguments) -> None:
+    has_policy = any(arguments.get(f"policy.{name}") is not None for name in ("type", "path"))
+    repo_id, root = arguments.get("dataset.repo_id"), arguments.get("dataset.root")
+    if arguments.get("fleet.server") is not None and not has_policy and repo_id is not None:
+        settings = RecordDatasetConfig(repo_id, None if root is None else Path(root))
+        act_by_newest_weights(arguments, settings.folder())
 
 
 if __name__ == "__main__":

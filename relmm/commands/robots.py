@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 from lerobot.robots.config import RobotConfig
 
 from relmm.commands.policies import take_seed
 from relmm.errors import ConfigError
 from relmm.robot.locobot import LocobotRobot
+from relmm.sim.locobot_sim import LocobotSim
+from relmm.sim.person import Person
+
+_PERSON_STREAM = 4  # keeps random numbers of one seed apart
 
 
 class Pause:
@@ -36,6 +41,11 @@ class Pause:
             self.charged()
         self._low = self._robot.needs_charging
         return self._low or self._stopped()
+
+
+def person_beside(robot: LocobotRobot, seed: int) -> Person | None:
+    """Who helps a simulated robot; nobody helps a real one unasked."""
+    return Person(robot, np.random.default_rng([seed, _PERSON_STREAM])) if isinstance(robot, LocobotSim) else None
 
 
 def make_locobot(config: RobotConfig, seed: int, command: str) -> LocobotRobot:

@@ -31,7 +31,8 @@ relmm-train: a robot is put into a room and learns to clean it.
   --resume=true                 go on with the run in that folder
   --dataset.repo_id=USER/NAME   name of the dataset that is recorded while learning
   --dataset.init=PATH_OR_REPO   a dataset to learn from first
-  --dataset.follow=PATH         a dataset that another process is recording, instead of a robot
+  --dataset.follow=PATH,PATH    datasets that other processes record, or folders of them, instead of a robot
+  --fleet.rooms=N               N simulated rooms at once, a process each, for one learner
   --dataset.push_to_hub=true    upload it
   --policy.push_to_hub=true     upload the checkpoint to --policy.repo_id=USER/NAME
   --hub.every=STEPS             upload while training, too
@@ -73,10 +74,26 @@ relmm-record: record a robot's life as a LeRobot dataset.
   --mode=practice               or clean: an episode is one room that is cleaned into the basket
   --max_steps=250               navigation steps after which an episode is cut off
   --pseudo_reset_steps=20       steps, at most, before and after an object is put down again
+  --fleet.server=HOST:PORT      send the episodes to relmm-serve there, and act by its newest weights
+  --fleet.token_file=FILE       the fleet's token
+  --fleet.certificate=FILE      of the server
   --seed=0                      of everything random
   --resume=true                 go on with the dataset in its folder
   --display_data=true           see what the robot sees and believes, in a viewer of rerun
   --display_path=FILE.rrd       in a file for that viewer instead
+""",
+    "relmm-serve": """\
+relmm-serve: robots on other machines send their episodes here, and get the newest weights of a training.
+
+  relmm-serve --dataset.root=data/fleet --output_dir=outputs/train/fleet \\
+      --fleet.token_file=token --fleet.certificate=server.pem --fleet.key=server.key
+
+  --dataset.root=FOLDER         of the robots' datasets; relmm-train --dataset.follow=FOLDER learns from them
+  --output_dir=FOLDER           of that relmm-train, whose newest weights the robots get
+  --fleet.listen=0.0.0.0:50151  HOST:PORT
+  --fleet.token_file=FILE       the token that robots must know
+  --fleet.certificate=FILE      of this server, PEM
+  --fleet.key=FILE              of the certificate, PEM
 """,
     "relmm-analyze": """\
 relmm-analyze: what a robot did, where it grasps well, and whether its confidence can be trusted.
@@ -139,6 +156,11 @@ def record() -> None:
 def analyze() -> None:
     """Entry point of `relmm-analyze`."""
     _start("relmm-analyze", "analyze")
+
+
+def serve() -> None:
+    """Entry point of `relmm-serve`."""
+    _start("relmm-serve", "serve")
 
 
 def upload() -> None:

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from relmm.commands.arguments import Arguments
 from relmm.commands.cli import StopOnSignal, now, run
@@ -18,32 +14,27 @@ from relmm.commands.display import live_views
 from relmm.commands.hub_resume import take_over_from_hub
 from relmm.commands.policy_type import choose_policy
 from relmm.commands.presets import resolve_config_path
-from relmm.commands.robots import Pause, make_locobot
+from relmm.commands.robots import Pause, make_locobot, person_beside
+from relmm.commands.rooms import Rooms
 from relmm.commands.sharing import check_uploads
 from relmm.commands.take_over import TakeOver
 from relmm.commands.train_config import TrainConfig
 from relmm.commands.train_evaluation import RoomEvaluation
+from relmm.commands.train_stream import train_on_stream
 from relmm.commands.training_bar import TrainingBar
 from relmm.commands.training_run import Run
 from relmm.episodes import (
-    Episode,
-    EpisodeFollower,
     EpisodeRecorder,
     check_new,
-    saved_episodes,
     summarize,
     verify_and_repair,
 )
 from relmm.learning.life import Life
 from relmm.learning.trainer import Trainer
+from relmm.policies.learning import LearningConfig
 from relmm.robot.locobot import LocobotRobot
 from relmm.sim.config_locobot_sim import LocobotSimConfig
-from relmm.sim.locobot_sim import LocobotSim
-from relmm.sim.person import Person
 from relmm.teleoperator.locobot_keyboard import TAKE_OVER, LocobotKeyboard
-
-_PERSON_STREAM = 4  # keeps random numbers of one seed apart
-_POLL_S = 0.5  # between looks at a dataset that is followed
 
 
 def train(config: TrainConfig) -> None:
@@ -54,13 +45,16 @@ def train(config: TrainConfig) -> None:
     check_uploads(config)
     with StopOnSignal() as signals:
         run = Run(config, signals)
-        if config.dataset.follow is not None:
-            _train_on_stream(run, config.dataset.follow)
+        if config.fleet.rooms:
+            _train_in_rooms(run)
+        elif config.dataset.follow is not None:
+            train_on_stream(run)
         else:
             _train_on_robot(run)
     assert config.output_dir is not None
     draw_learning_curve(config.output_dir / "metrics.jsonl", config.output_dir / "learning_curve.png")
-    kept = "checkpoints, metrics" if config.robot is None else "checkpoints, metrics, dataset"
+    recorded = "rooms" if config.fleet.rooms else "dataset" if config.robot is not None else ""
+    kept = ", ".join(filter(None, ["checkpoints", "metrics", recorded]))
     print(f"{kept} and learning_curve.png: {config.output_dir}")
     run.finish()
 
@@ -91,7 +85,7 @@ def _train_on_robot(run: Run) -> None:
                 config.max_steps,
                 should_stop=pause,
             )
-            person = _person(robot, seed)
+            person = person_beside(robot, seed)
 
             def charged() -> None:
                 run.progress.interventions += 1
@@ -137,6 +131,21 @@ def _take_over(
     return TakeOver(robot, keyboard, lambda: run.signals.stopped, say)
 
 
+def _train_in_rooms(run: Run) -> None:
+    config = run.config
+    assert isinstance(config.policy, LearningConfig)
+    shares = {name: -(-getattr(config.policy, name) // config.fleet.rooms) for name in ("num_stationary", "num_max")}
+    options = [
+        *(f"--policy.{name}={share}" for name, share in shares.items()),
+        *("--policy.sample=true", "--policy.device=cpu", f"--curriculum.type={config.curriculum.type}"),
+        *(f"--{name}={getattr(config, name)}" for name in ("max_steps", "pseudo_reset_steps")),
+    ]
+    policy = config.checkpoints / "last" / "pretrained_model"
+    robot = run.saved_config["robot"]
+    with Rooms(config.followed[0], robot, policy, config.fleet.rooms, config.seed, options) as rooms:
+        train_on_stream(run, lambda bar: rooms.watch(bar.write), lambda bar: _evaluation(run, bar), lambda: str(rooms))
+
+
 def _own_dataset(run: Run) -> tuple[int, bool]:
     """See that the run's dataset is there, and repair it; its episodes, and whether any were lost."""
     config = run.config
@@ -169,11 +178,6 @@ def _recorder(run: Run, robot: LocobotRobot, seed: int) -> EpisodeRecorder:
     )
 
 
-def _person(robot: LocobotRobot, seed: int) -> Person | None:
-    """Beside a simulated robot; nobody helps a real one unasked."""
-    return Person(robot, np.random.default_rng([seed, _PERSON_STREAM])) if isinstance(robot, LocobotSim) else None
-
-
 def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:
     settings = run.config.robot
     if not isinstance(settings, LocobotSimConfig):
@@ -195,28 +199,6 @@ def _evaluation(run: Run, bar: TrainingBar) -> Callable[[], dict[str, Any]]:
         return scores
 
     return evaluate
-
-
-def _train_on_stream(run: Run, root: Path) -> None:
-    run.check_cursor(saved_episodes(root))
-    run.read_initial_data()
-    run.track()
-    follower = EpisodeFollower(root, run.read_own_data(), run.policy.config.camera)
-
-    def episodes() -> Iterator[Episode]:
-        while not run.signals.stopped:
-            before = follower.next
-            for episode in follower.read_new():
-                yield episode
-                if run.signals.stopped:
-                    return
-            if follower.next == before:
-                time.sleep(_POLL_S)
-
-    with run.bar(f"following {root}") as bar:
-        if not root.exists():
-            bar.write(f"waiting for {root}, which is not there yet: start its recorder, or check the name")
-        run.session(lambda: run.save(follower.next), dict, bar).follow(episodes())
 
 
 def main() -> None:

@@ -33,7 +33,10 @@ class TrainDatasetConfig:
         repo_id: name of the dataset, `user/name`.
         root: its folder; None for `dataset` in the output folder.
         init: a dataset (folder, or user/name on the Hub) to fill the replay with and train on first.
-        follow: a dataset that another process is recording; there is no robot then.
+        follow: datasets that other processes are recording, or folders of such datasets, with commas between them;
+            there is no robot then.
+        max_waiting: episodes of these that may wait for the learner; what comes while more do is remembered, but
+            without updates of its own.
         push_to_hub: upload it to `repo_id` at the end, and every `hub.every` steps.
         private: whether a new repository is private; None for the owner's default.
         license: for its card, an identifier of the Hub.
@@ -42,13 +45,20 @@ class TrainDatasetConfig:
     repo_id: str = "local/relmm"
     root: Path | None = None
     init: str | None = None
-    follow: Path | None = None
+    follow: str | None = None
+    max_waiting: int = 100
     push_to_hub: bool = False
     private: bool | None = None
     license: str = LICENSE
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
+        check_range("dataset.max_waiting", self.max_waiting, 0, MANY)
+        if self.follow is not None and not all(self.follow.split(",")):
+            raise ConfigError(
+                f"dataset.follow is {self.follow!r}, which has an empty name in it: say --dataset.follow=FOLDER or "
+                "--dataset.follow=FOLDER,FOLDER,..."
+            )
         if self.push_to_hub and self.repo_id.startswith("local/"):
             raise ConfigError(
                 f"dataset.repo_id is {self.repo_id!r}, which is on this machine only: also say "
@@ -73,6 +83,21 @@ class HubConfig:
 
     def __post_init__(self) -> None:
         check_range("hub.every", self.every, 0, MANY)
+
+
+@dataclass
+class TrainFleetConfig:
+    """Several rooms at once.
+
+    Args:
+        rooms: simulated rooms that record at the same time, a process each, for one learner; 0 for the robot in this
+            process. Their datasets are in `rooms/` of the output folder.
+    """
+
+    rooms: int = 0
+
+    def __post_init__(self) -> None:
+        check_range("fleet.rooms", self.rooms, 0, 1000)
 
 
 @dataclass
@@ -120,6 +145,7 @@ class TrainConfig(DisplayOptions):
         teleop: `--teleop.type=locobot_keyboard` lets a person take over with the key t.
         dataset: where the robot's life is kept, and what is learned from besides.
         policy: `--policy.type=relmm` and its hyper-parameters, or `--policy.path` to go on from.
+        fleet: several rooms at once.
         curriculum: `--curriculum.type=stationary`, `autonomous` or `none`.
         eval: evaluation while training.
         hub: when to upload; what, is said with `--policy.push_to_hub`, `--policy.repo_id`, `--dataset.push_to_hub`.
@@ -144,6 +170,7 @@ class TrainConfig(DisplayOptions):
     teleop: TeleoperatorConfig | None = field(default=None, metadata={"choices": LocobotKeyboardConfig})
     dataset: TrainDatasetConfig = field(default_factory=TrainDatasetConfig)
     policy: PreTrainedConfig | None = field(default=None, metadata={"choices": LearningConfig})
+    fleet: TrainFleetConfig = field(default_factory=TrainFleetConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     eval: TrainEvalConfig = field(default_factory=TrainEvalConfig)
     hub: HubConfig = field(default_factory=HubConfig)
@@ -178,8 +205,8 @@ class TrainConfig(DisplayOptions):
                     "folder, or train into another one without --resume."
                 )
             raise ConfigError(
-                "Say what to learn from: either a robot (--robot.type=locobot_sim) or a dataset that another process "
-                "records (--dataset.follow=FOLDER), not both."
+                "Say what to learn from: either a robot (--robot.type=locobot_sim) or datasets that other processes "
+                "record (--dataset.follow=FOLDER,FOLDER,...), not both."
             )
         if self.teleop is not None and self.robot is None:
             raise ConfigError("--teleop is for a person beside a robot: leave it out with --dataset.follow.")
@@ -187,6 +214,7 @@ class TrainConfig(DisplayOptions):
             raise ConfigError(
                 f"teleop.type is {self.teleop.type!r}, but a person takes over with --teleop.type=locobot_keyboard."
             )
+        self._check_rooms()
         check_camera(self.policy, "robot.camera", self.robot)
         if self.policy.seed is None:
             self.policy.seed = self.seed
@@ -194,6 +222,20 @@ class TrainConfig(DisplayOptions):
         self._check_display()
         check_tracking(self.wandb)
         self._choose_folder()
+
+    def _check_rooms(self) -> None:
+        if not self.fleet.rooms:
+            return
+        if self.robot is None or self.robot.type != "locobot_sim":
+            raise ConfigError(
+                f"fleet.rooms is {self.fleet.rooms}, and only a simulated robot can be in several rooms: say "
+                "--robot.type=locobot_sim, or leave out --fleet.rooms."
+            )
+        if self.dataset.root is not None or self.dataset.push_to_hub:
+            raise ConfigError(
+                "With --fleet.rooms each room has a dataset of its own in rooms/ of the output folder: leave out "
+                "--dataset.root and --dataset.push_to_hub, and upload them with relmm-upload."
+            )
 
     def _check_uploads(self) -> None:
         policy = self.policy
@@ -226,6 +268,14 @@ class TrainConfig(DisplayOptions):
             raise ConfigError(
                 f"{self.output_dir} exists already: choose another --output_dir, or go on with --resume=true."
             )
+
+    @property
+    def followed(self) -> list[Path]:
+        """The datasets, and folders of datasets, that other processes record and this one learns from."""
+        if self.fleet.rooms:
+            assert self.output_dir is not None
+            return [self.output_dir / "rooms"]
+        return [] if self.dataset.follow is None else [Path(name) for name in self.dataset.follow.split(",")]
 
     @property
     def checkpoints(self) -> Path:

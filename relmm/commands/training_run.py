@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from relmm.episodes import (
 )
 from relmm.episodes.folder import DatasetFolder
 from relmm.episodes.info import runs_of
+from relmm.episodes.sources import Cursor
 from relmm.episodes.upload import recorded_runs
 from relmm.errors import ConfigError
 from relmm.learning.checkpoint import (
@@ -71,6 +72,7 @@ class Run:
         self.learner = policy.make_learner(config.seed, config.replay_frames)
         self.rng = np.random.default_rng([config.seed, _STREAM])
         self.progress = Progress()
+        self.words: Callable[[], str] = str  # more of them for the progress bar
         self.learned = 0  # episodes of the run's dataset that the checkpoint has learned from
         if self.checkpoint is not None:
             counters = load_training_state(self.checkpoint, self.learner, self.rng)
@@ -78,14 +80,16 @@ class Run:
         self.listeners: list[Callable[[dict[str, Any]], None]] = []  # to the metrics
         assert config.output_dir is not None
         self._tracker: Tracker | None = None
-        page = config.output_dir / REPORT
-        self._report = TrainingReport(self.data, config.dataset.repo_id, page) if config.report else None
+        self._report: TrainingReport | None = None
+        recorded = config.followed or [self.data]
+        if config.report and len(recorded) == 1 and not config.fleet.rooms:  # a report is of one dataset
+            self._report = TrainingReport(recorded[0], config.dataset.repo_id, config.output_dir / REPORT)
         self.uploads = Uploads(run_arguments(config), config.output_dir)
 
     @property
     def data(self) -> Path:
-        """The folder of the dataset that the run learns from."""
-        return self.config.dataset.follow or self.config.dataset_root
+        """The folder of the dataset that the run records and learns from."""
+        return self.config.dataset_root
 
     def check_cursor(self, episodes: int) -> None:
         """Refuse to go on without the data that the checkpoint has learned from.
@@ -126,11 +130,14 @@ class Run:
                 episodes = episode.index + 1
         return episodes
 
-    def save(self, episodes: int) -> None:
-        """Write a checkpoint.
+    def save(self, episodes: int, runs: list[dict[str, Any]] | None = None, sources: Sequence[Cursor] = ()) -> Path:
+        """Write a checkpoint; its folder.
 
         Args:
-            episodes: of the run's dataset that the weights have learned from; a resumed run learns the later ones.
+            episodes: that the weights have learned from, of the run's dataset or of those of others; a resumed run
+                learns the later ones.
+            runs: with what they were recorded; None for those of the run's own dataset.
+            sources: how far each dataset of others has been learned from.
         """
         counters = {"episodes": episodes, "interventions": self.progress.interventions}
         checkpoint = save_checkpoint(
@@ -141,12 +148,14 @@ class Run:
             self.rng,
             counters,
             self.saved_config,
-            recorded_runs(DatasetFolder(self.data)),
+            recorded_runs(DatasetFolder(self.data)) if runs is None else runs,
+            sources,
         )
         if self._tracker is not None:
             self._tracker.log_checkpoint(checkpoint)
         if self._report is not None and episodes:
             self._report.refresh()
+        return checkpoint
 
     def track(self) -> None:
         """Begin to log to Weights & Biases, if that is asked for; to be called when the run is sure to begin.
@@ -193,6 +202,7 @@ class Run:
 
         def show(status: dict[str, Any]) -> None:
             words = f"{status['objects']} objects, {status['successes']}/{status['attempts']} grasps"
+            words = ", ".join(filter(None, [words, self.words()]))
             bar.advance("practice", status["practice_attempts"], words)
             bar.advance("steps", status["steps"], words)
             self.uploads.check()
@@ -218,7 +228,9 @@ def settings_to_keep(config: TrainConfig) -> dict[str, Any]:
     for option in fields(DisplayOptions):  # who looks on today need not look on after a resume
         del settings[option.name]
     dataset = settings["dataset"]
-    for name in ("root", "follow", "init"):
+    if dataset["follow"] is not None:
+        dataset["follow"] = ",".join(str(place.absolute()) for place in config.followed)
+    for name in ("root", "init"):
         # What does not exist yet is a folder, too, but for `init`: that may be a name on the Hub.
         if dataset[name] is not None and (name != "init" or Path(dataset[name]).exists()):
             dataset[name] = str(Path(dataset[name]).absolute())

@@ -7,7 +7,7 @@ listed is there and stays as it is, and every file has to be read only once. Nee
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from relmm.episodes.settings import TRAINING_COLUMNS, check_trainable
 from relmm.episodes.survey import read_columns, read_places, rows_of
 from relmm.episodes.video import VIDEO_COLUMNS, in_video, read_video
 from relmm.errors import DatasetError
-from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES
+from relmm.features import ACTION_NAMES, IMAGE_KEY, IMAGE_SIZE, STATE_KEY, STATE_NAMES, WEIGHTS_STEP
 
 _WRONG_TYPES = (ValueError, TypeError, AttributeError, KeyError, pa.ArrowException)  # of columns of other types
 MAX_STEPS = 10_000  # navigation steps of an episode, and of a pseudo-reset before and after it
@@ -47,6 +47,7 @@ class Episode:
         phases: (n,) int64, a `relmm.features.Phase` each.
         grasp_probabilities: (n,) float32, P[grasp], -1 where it was not asked.
         robot_times: (n,) float32, s on the robot's clock.
+        weights_step: steps of the learner whose weights acted last, -1 where that is not known.
     """
 
     index: int
@@ -59,6 +60,7 @@ class Episode:
     phases: NDArray[np.int64]
     grasp_probabilities: NDArray[np.float32]
     robot_times: NDArray[np.float32]
+    weights_step: int = -1
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -96,7 +98,58 @@ def _read_all(follower: EpisodeFollower) -> Iterator[Episode]:
         stopped_at = follower.next
 
 
-class EpisodeFollower:
+class RowFollower:
+    """Reads the list of a growing dataset's episodes: each row once, and in order.
+
+    Attributes:
+        next: number of the next episode; whoever takes one counts on.
+        problem: why the last reading stopped, in words; empty when it came to the end.
+        more_columns: of the list, to be read besides `PLACE_COLUMNS`.
+    """
+
+    def __init__(self, root: Path | str, first: int) -> None:
+        self.next, self.problem = first, ""
+        self.more_columns: Sequence[str] = ()
+        self._folder = DatasetFolder(root)
+        # By file of meta/episodes: which one it was when it was read, and the number of its last episode.
+        self._last_episodes: dict[str, tuple[int, int]] = {}
+
+    def new_rows(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Rows of meta/episodes from episode `next` on, with the file each is in; reads a file when it is needed."""
+        names = self._folder.files(EPISODE_FILES)
+        for name in names[bisect_left(names, self.next, key=self._last_episode) :]:
+            rows = self._rows(name)
+            if rows is None:
+                self.problem = f"{self._folder.root / name} is missing or cut off"
+                return
+            yield from ((name, row) for row in rows if row["episode_index"] >= self.next)
+
+    def _last_episode(self, name: str) -> int:
+        """Of a file of meta/episodes; for one that cannot be read, a number that does not let it be skipped."""
+        known = self._last_episodes.get(name)
+        if known is None or known[0] != self._inode(name):  # another file has taken its place, with more in it
+            self._rows(name)
+            known = self._last_episodes.get(name)
+        return self.next if known is None else known[1]
+
+    def _inode(self, name: str) -> int:
+        try:
+            return (self._folder.root / name).stat().st_ino
+        except FileNotFoundError:
+            return -1
+
+    def _rows(self, name: str) -> list[dict[str, Any]] | None:
+        inode = self._inode(name)  # before it is read: what comes in between is seen as another one the next time
+        table = read_places(self._folder.root / name, self.more_columns)
+        if table is None:
+            return None
+        rows: list[dict[str, Any]] = table.to_pylist()
+        if rows:
+            self._last_episodes[name] = inode, rows[-1]["episode_index"]
+        return rows
+
+
+class EpisodeFollower(RowFollower):
     """Reads episodes as they are saved: each once, whole, and in order.
 
     Attributes:
@@ -116,13 +169,9 @@ class EpisodeFollower:
         Raises:
             DatasetError: it exists, and is none that relmm can train on.
         """
-        self.next = first
-        self.problem = ""
-        self._folder = DatasetFolder(root)
+        super().__init__(root, first)
         self._camera = camera
         self._data = self._find_data()
-        # By file of meta/episodes: which one it was when it was read, and the number of its last episode.
-        self._last_episodes: dict[str, tuple[int, int]] = {}
 
     def poll(self) -> list[Episode]:
         """The episodes that were saved since the last call; none while there is no dataset.
@@ -140,7 +189,7 @@ class EpisodeFollower:
         if self._data is None:
             return
         data = _DataFiles(self._folder, self._data)
-        for row in self._new_rows():
+        for _, row in self.new_rows():
             episode = data.read(row) if row["episode_index"] == self.next else None
             if episode is None:
                 self.problem = f"episode {self.next} of {self._folder.root} is missing or cut off"
@@ -148,49 +197,32 @@ class EpisodeFollower:
             self.next += 1
             yield episode
 
+    def read_frames(self, row: dict[str, Any], frames: pa.Table) -> Episode | None:
+        """An episode that is in memory, checked like any other.
+
+        Args:
+            row: of meta/episodes.
+            frames: with the columns of a data file.
+
+        Returns:
+            The episode; None when the frames are not all there.
+
+        Raises:
+            DatasetError: as `poll`.
+        """
+        assert self._data is not None
+        return _DataFiles(self._folder, self._data).read_table(row, frames.select(self._data.columns))
+
     def _find_data(self) -> _Layout | None:
         info = self._folder.read_json(INFO)
         if info is None:
             return None
         check_trainable(self._folder.root, self._camera)
         filmed = in_video(info["features"])
-        columns = [name for name in TRAINING_COLUMNS if name in info["features"] and not (filmed and name == IMAGE_KEY)]
+        self.more_columns = VIDEO_COLUMNS if filmed else ()
+        wanted = (*TRAINING_COLUMNS, WEIGHTS_STEP)
+        columns = [name for name in wanted if name in info["features"] and not (filmed and name == IMAGE_KEY)]
         return _Layout(str(info["data_path"]), ["episode_index", "index", *columns], float(info["fps"]), filmed)
-
-    def _new_rows(self) -> Iterator[dict[str, Any]]:
-        """Rows of meta/episodes from episode `next` on; reads each file when it is needed."""
-        names = self._folder.files(EPISODE_FILES)
-        for name in names[bisect_left(names, self.next, key=self._last_episode) :]:
-            rows = self._rows(name)
-            if rows is None:
-                self.problem = f"{self._folder.root / name} is missing or cut off"
-                return
-            yield from (row for row in rows if row["episode_index"] >= self.next)
-
-    def _last_episode(self, name: str) -> int:
-        """Of a file of meta/episodes; for one that cannot be read, a number that does not let it be skipped."""
-        known = self._last_episodes.get(name)
-        if known is None or known[0] != self._inode(name):  # another file has taken its place, with more in it
-            self._rows(name)
-            known = self._last_episodes.get(name)
-        return self.next if known is None else known[1]
-
-    def _inode(self, name: str) -> int:
-        try:
-            return (self._folder.root / name).stat().st_ino
-        except FileNotFoundError:
-            return -1
-
-    def _rows(self, name: str) -> list[dict[str, Any]] | None:
-        inode = self._inode(name)  # before it is read: what comes in between is seen as another one the next time
-        in_videos = self._data is not None and self._data.in_video
-        table = read_places(self._folder.root / name, VIDEO_COLUMNS if in_videos else ())
-        if table is None:
-            return None
-        rows: list[dict[str, Any]] = table.to_pylist()
-        if rows:
-            self._last_episodes[name] = inode, rows[-1]["episode_index"]
-        return rows
 
 
 @dataclass(frozen=True)
@@ -217,9 +249,11 @@ class _DataFiles:
         if name != self._name:
             self._name = name
             self._table = read_columns(self._folder.root / name, self._layout.columns)
-            if self._table is not None and not are_whole_numbers(self._table, ["episode_index", "index"]):
-                self._table = None
-        frames = None if self._table is None else rows_of(row, self._table)
+        return None if self._table is None else self.read_table(row, self._table)
+
+    def read_table(self, row: dict[str, Any], table: pa.Table) -> Episode | None:
+        """The episode of a row; None when a table of its columns does not hold it whole."""
+        frames = rows_of(row, table) if are_whole_numbers(table, ["episode_index", "index"]) else None
         return None if frames is None else self._episode(row, frames)
 
     def _episode(self, row: dict[str, Any], frames: pa.Table) -> Episode | None:
@@ -260,7 +294,16 @@ class _DataFiles:
             phases=_numbers(frames["complementary_info.phase"], np.int64),
             grasp_probabilities=_numbers(frames["complementary_info.grasp_probability"], np.float32),
             robot_times=_numbers(frames["complementary_info.robot_time"], np.float32),
+            weights_step=int(_numbers(frames[WEIGHTS_STEP], np.int64)[-1])
+            if WEIGHTS_STEP in frames.column_names
+            else -1,
         )
+
+
+def _weights_step(frames: pa.Table) -> int:
+    if WEIGHTS_STEP not in frames.column_names or not len(frames):
+        return -1
+    return int(_numbers(frames[WEIGHTS_STEP], np.int64)[-1])
 
 
 def _numbers(column: pa.ChunkedArray, dtype: DTypeLike) -> NDArray[Any]:

@@ -27,9 +27,10 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """
     limit = _PLAUSIBLE_BYTES + _PLAUSIBLE_RATIO * path.stat().st_size
     with pq.ParquetFile(path) as file:
-        wanted = [name for name in file.schema_arrow.names if columns is None or name in columns]
+        everything = file.schema_arrow  # made anew each time it is asked for, which takes longer than the rest
+        wanted = [name for name in everything.names if columns is None or name in columns]
         for name in wanted:
-            _refuse_dictionaries(path, file.schema_arrow.field(name))
+            _refuse_dictionaries(path, everything.field(name))
         size, batches = _claimed_bytes(file.metadata), []
         _refuse(path, size, limit)
         size = 0
@@ -38,7 +39,7 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
             size += batch.nbytes
             _refuse(path, size, limit)
             batches.append(batch)
-        schema = batches[0].schema if batches else file.schema_arrow.empty_table().select(wanted).schema
+        schema = batches[0].schema if batches else everything.empty_table().select(wanted).schema
     return pa.Table.from_batches(batches, schema).combine_chunks()
 
 

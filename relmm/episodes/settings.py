@@ -85,7 +85,7 @@ def check_resume(
     features = have["features"]
     _refuse_old(root, features)
     differences = _differences("fps", have["fps"], FPS)
-    differences += _feature_differences(features, dataset_features(DEPTH_KEY in features if depth is None else depth))
+    differences += feature_differences(features, dataset_features(DEPTH_KEY in features if depth is None else depth))
     if robot_type is not None:
         differences += _differences("robot type", have["robot_type"], robot_type)
     if info is not None and "camera" in info:
@@ -181,7 +181,8 @@ def _refuse_old(root: Path | str, features: dict[str, Any]) -> None:
         )
 
 
-def _feature_differences(have: dict[str, Any], want: dict[str, Any]) -> list[str]:
+def feature_differences(have: dict[str, Any], want: dict[str, Any]) -> list[str]:
+    """In which columns two schemas differ, in words; those that LeRobot adds by itself do not count."""
     differences: list[str] = []
     for key in sorted((have.keys() | want.keys()) - set(LEROBOT_COLUMNS)):
         differences += _differences(f"column {key}", _describe(have.get(key)), _describe(want.get(key)))

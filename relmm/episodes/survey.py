@@ -68,10 +68,14 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table | None:
 def read_places(path: Path, more: Sequence[str] = ()) -> pa.Table | None:
     """`PLACE_COLUMNS`, and more, of a file of meta/episodes; None also where the first are not whole numbers."""
     table = read_columns(path, [*PLACE_COLUMNS, *more])
-    if table is None or not are_whole_numbers(table, PLACE_COLUMNS[:-1]):
-        return None
-    tasks = table["tasks"]
-    return table if pa.types.is_list(tasks.type) and tasks.null_count == 0 else None
+    return table if table is not None and are_places(table) else None
+
+
+def are_places(table: pa.Table) -> bool:
+    """Whether `PLACE_COLUMNS` are there, and what they must be."""
+    if not set(PLACE_COLUMNS) <= set(table.column_names) or not are_whole_numbers(table, PLACE_COLUMNS[:-1]):
+        return False
+    return bool(pa.types.is_list(table["tasks"].type)) and table["tasks"].null_count == 0
 
 
 def rows_of(episode: dict[str, Any], table: pa.Table) -> pa.Table | None:

@@ -13,7 +13,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from relmm.episodes.folder import sync
+from relmm.episodes.info import runs_of
+from relmm.episodes.sources import Cursor
 from relmm.errors import MANY, ConfigError, DiskError
 from relmm.learning.actor import Actor
 from relmm.learning.moments import load_moments
@@ -62,6 +65,7 @@ def save_checkpoint(
     counters: dict[str, Any],
     config: dict[str, Any],
     runs: list[dict[str, Any]],
+    sources: Sequence[Cursor] = (),
 ) -> Path:
     """Write `folder/<step>` and point `folder/last` to it.
 
@@ -74,6 +78,7 @@ def save_checkpoint(
         counters: of the run; JSON values.
         config: of the run, for `train_config.json`.
         runs: with what the run's dataset was recorded; see `relmm.episodes.upload.recorded_runs`.
+        sources: how far each dataset of others has been learned from, where the run has none of its own.
 
     Returns:
         The checkpoint's folder.
@@ -91,7 +96,8 @@ def save_checkpoint(
     save_optimizer_state(learner.optimizers, temporary / _STATE)
     _write_json(temporary / _STATE / STEP, {"step": step})
     states = {"trainer": rng.bit_generator.state, "learner": learner.rng.bit_generator.state}
-    _write_json(temporary / _STATE / _COUNTERS, {"counters": counters, "random": states, "runs": runs})
+    state = {"counters": counters, "random": states, "runs": runs, "sources": [asdict(source) for source in sources]}
+    _write_json(temporary / _STATE / _COUNTERS, state)
     save_file({"noise": learner.noise.get_state()}, temporary / _STATE / _RANDOM)
     write_sums(temporary / _MODEL, leave_out=(SETTINGS,))  # which becomes portable on its way to the Hub
     write_sums(temporary / _STATE)
@@ -166,6 +172,25 @@ def read_training_state(checkpoint: Path) -> dict[str, Any]:
     """Counters, random states, and with what the dataset was recorded, as `save_checkpoint` wrote them."""
     state: dict[str, Any] = read_json(checkpoint / _STATE / _COUNTERS)
     return state
+
+
+def read_cursors(checkpoint: Path) -> list[Cursor]:
+    """How far each dataset of others has been learned from.
+
+    Raises:
+        ConfigError: that is not told as `save_checkpoint` tells it.
+    """
+    try:
+        cursors = [Cursor(**source) for source in read_training_state(checkpoint)["sources"]]
+        for cursor in cursors:
+            _count(cursor.name, cursor.episodes)
+            if runs_of({"runs": cursor.runs}) != cursor.runs:
+                raise ValueError(f"the runs of {cursor.name} are none")
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(
+            f"The training state in {checkpoint} does not say what it has learned from ({error}); resume another."
+        ) from error
+    return cursors
 
 
 def load_training_state(checkpoint: Path, learner: Learner, rng: Any) -> dict[str, Any]:

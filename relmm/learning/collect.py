@@ -1,14 +1,19 @@
-"""The two ways to record: practice without resets, where what is picked up is carried elsewhere, and cleaning rooms."""
+"""The ways to record: practice without resets, where what is picked up is carried elsewhere, and cleaning rooms."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from relmm.features import Phase
+from relmm.features import ACTION_NAMES, Phase, Skill
 from relmm.learning.actor import Actor
 from relmm.learning.life import EpisodeResult, Life
+from relmm.learning.progress import Progress
+from relmm.learning.trainer import Trainer
+from relmm.policies.learning import Learner, LearningPolicy
 
 
 class Collector:
@@ -40,6 +45,59 @@ class Collector:
                 return True
             self._actor.watch(self._life.observation)
         return False
+
+
+class Practice:
+    """The paper's algorithms, with their curricula, where the learner is elsewhere: as `Trainer`, but for the updates.
+
+    Args:
+        life: of the robot.
+        policy: to act by; others renew its weights.
+        watcher: one of the life's recorders; counts what the autonomous curriculum depends on.
+        progress: another; counts what the stationary curriculum depends on.
+        options: more of them for `Trainer`.
+    """
+
+    def __init__(
+        self, life: Life, policy: LearningPolicy, watcher: Watcher, progress: Progress, **options: Any
+    ) -> None:
+        self._life = life
+        self._trainer = Trainer(life, policy, watcher, progress=progress, **options)
+
+    def episode(self) -> EpisodeResult:
+        """Go on until an episode has ended, or it is time to stop; what a recorder raises comes through."""
+        ended = self._life.episodes_ended
+        while self._life.episodes_ended == ended and not self._life.should_stop():
+            if self._trainer.in_stationary_curriculum:
+                self._trainer.stationary_attempt()
+            else:
+                self._trainer.navigation_step()
+        return self._life.last_episode if self._life.episodes_ended > ended else EpisodeResult()
+
+
+class Watcher(Learner):
+    """Counts attempts as a learner does, and learns nothing."""
+
+    def add(
+        self,
+        picture: NDArray[np.uint8],
+        state: NDArray[np.float32],
+        action: NDArray[np.float32],
+        success: bool,
+        phase: int,
+    ) -> None:
+        """See `Learner`."""
+        if round(float(action[ACTION_NAMES.index("skill.pos")])) == Skill.GRASP:
+            self.count_attempt(success)
+
+    def save_episode(self) -> None:
+        """See `Learner`."""
+
+    def update_grasping(self, phase: int) -> None:
+        """See `Learner`."""
+
+    def update_navigation(self) -> None:
+        """See `Learner`."""
 
 
 class Cleaner:

@@ -24,6 +24,7 @@ from relmm.features import (
     ODOMETRY,
     PRACTICE_TASK,
     TASK,
+    WEIGHTS_STEP,
     FloatArray,
     Phase,
     Skill,
@@ -84,6 +85,8 @@ class Life:
         pose: x, y (m) and heading (rad, not wrapped) by the robot's own wheels since this life began.
         episode: what has happened in the running episode.
         succeeded: whether the last step picked something up.
+        episodes_ended: how many; the result of the newest is in `last_episode`.
+        weights_step: steps of the learner elsewhere whose weights act, -1 without one.
     """
 
     def __init__(
@@ -103,6 +106,7 @@ class Life:
         self.pose: FloatArray = np.zeros(3)
         self.episode = EpisodeResult()
         self.succeeded = False
+        self.episodes_ended, self.weights_step = 0, -1
 
     @property
     def holding(self) -> bool:
@@ -147,6 +151,7 @@ class Life:
             **{f"complementary_info.{name}": (belief or {}).get(name, -1.0) for name in BELIEF},
             **{f"complementary_info.{name}": value for name, value in zip(ODOMETRY, odometry, strict=True)},
             "complementary_info.robot_time": seconds,
+            WEIGHTS_STEP: self.weights_step,
         }
         for recorder in self._recorders:
             recorder.add_frame(before, done_action, outcome, self._task)
@@ -179,6 +184,7 @@ class Life:
     def _begin_episode(self, success: bool) -> None:
         self.episode.success = success
         self.last_episode, self.episode = self.episode, EpisodeResult()
+        self.episodes_ended += 1
         self._grasps_since_drive = 0
 
 

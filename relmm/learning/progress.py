@@ -40,7 +40,7 @@ class Progress:
     robot_minutes: float = 0.0
 
     def __post_init__(self) -> None:
-        self._time = 0.0  # s on the robot's clock, at the last frame
+        self._times: dict[str, float] = {}  # s on each robot's clock, at its last frame
 
     def add_frame(
         self, observation: dict[str, Any], action: dict[str, float], outcome: dict[str, Any], task: str
@@ -49,13 +49,13 @@ class Progress:
         time = outcome["complementary_info.robot_time"]
         self._add(action["skill.pos"], outcome["next.reward"] > 0, outcome["complementary_info.phase"], time)
 
-    def read(self, episode: Episode) -> None:
-        """Count the frames of a recorded episode."""
+    def read(self, episode: Episode, robot: str = "") -> None:
+        """Count the frames of a recorded episode, and of which robot it is, where there are several."""
         columns = (episode.actions[:, _SKILL], episode.rewards > 0, episode.phases, episode.robot_times)
         for skill, success, phase, time in zip(*columns, strict=True):
-            self._add(float(skill), bool(success), int(phase), float(time))
+            self._add(float(skill), bool(success), int(phase), float(time), robot)
 
-    def _add(self, skill: float, success: bool, phase: int, time: float) -> None:
+    def _add(self, skill: float, success: bool, phase: int, time: float, robot: str = "") -> None:
         grasped, drove = round(skill) == Skill.GRASP, round(skill) == Skill.NAVIGATE
         self.steps += drove and phase == Phase.LEARNING
         self.practice_attempts += grasped and phase == Phase.CURRICULUM
@@ -64,8 +64,9 @@ class Progress:
         self.objects += bool(success) and phase == Phase.LEARNING
         self.pseudo_reset_steps += drove and phase == Phase.PSEUDO_RESET
         # The clock begins anew with each life of the robot.
-        self.robot_minutes += (time - self._time if time >= self._time else time) / 60
-        self._time = time
+        last = self._times.get(robot, 0.0)
+        self.robot_minutes += (time - last if time >= last else time) / 60
+        self._times[robot] = time
 
     def save_episode(self) -> None:
         """Nothing to do."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from relmm.episodes.follow import Episode
+from relmm.learning.intake import Intake
 from relmm.learning.progress import Metrics, Progress
 from relmm.learning.trainer import Trainer
 from relmm.policies.learning import Learner
@@ -64,6 +65,7 @@ class Session:
         self._started = time.monotonic() - metrics.seconds  # a resumed run goes on
         self._saved_at = -1
         self._logged: dict[str, float] = {}
+        self._more_logs: Callable[[], dict[str, float]] = dict
 
     def live(self, trainer: Trainer, should_stop: Callable[[], bool]) -> None:
         """Train on a robot until the last step, or until told to stop; ends with a checkpoint."""
@@ -80,14 +82,26 @@ class Session:
             self._after(before)
         self._end()
 
-    def follow(self, episodes: Iterable[Episode]) -> None:
-        """Train on episodes that come in from elsewhere, until the last step or the last of them."""
+    def follow(self, episodes: Iterable[tuple[str, Episode] | None], intake: Intake) -> None:
+        """Train on episodes that come in from elsewhere, until the last step or the last of them.
+
+        Args:
+            episodes: with the dataset that each is of; None where there is none for the moment.
+            intake: takes them, and tells how well it keeps up.
+        """
         self._begin()
-        for episode in episodes:
-            before = self._progress.steps
-            self._progress.read(episode)
-            self._learner.read(episode, update=True)
-            self._after(before, save=True)
+        self._more_logs = intake.logs
+        for arrival in episodes:
+            if arrival is None:
+                if intake.weights_are_due:
+                    self._checkpoint()
+                continue
+            before, practised = self._progress.steps, self._progress.practice_attempts
+            intake.take(*arrival)
+            self._saved_at = -1  # what was saved at this step has not learned from this episode
+            self._after(before, save=intake.weights_are_due)
+            if _passed(practised, self._progress.practice_attempts, _PRACTICE_LOG_FREQ):
+                self._log()
             if self._progress.steps >= self._schedule.steps:
                 break
         self._end()
@@ -116,7 +130,7 @@ class Session:
 
     def _log(self) -> None:
         self._logged = self._progress.asdict()
-        self._metrics.write(**self._status(), **self._learner.logs)
+        self._metrics.write(**self._status(), **self._learner.logs, **self._more_logs())
 
     def _checkpoint(self) -> None:
         if self._saved_at != self._progress.steps:

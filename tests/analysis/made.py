@@ -55,6 +55,7 @@ def write(root: Path, episodes: list[list[dict[str, Any]]], info: dict[str, Any]
                     **{f"complementary_info.{name}": value for name, value in belief.items()},
                     **dict(zip((f"complementary_info.{name}" for name in ODOMETRY), (x, 0.0, 0.0), strict=True)),
                     "complementary_info.robot_time": clock,
+                    "complementary_info.weights_step": -1,
                 }
                 dataset.add_frame(build({**state, "front": image}, action, outcome), "tidy")
                 holding = bool(frame.get("success", False))

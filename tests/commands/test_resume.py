@@ -14,9 +14,9 @@ import pytest
 
 from relmm.commands import record as record_module
 from relmm.commands import train as module
-from relmm.commands import training_run
 from relmm.episodes import DurableDataset, read_episodes, summarize, verify_and_repair
 from relmm.episodes.settings import LEROBOT_COLUMNS
+from relmm.episodes.sources import Sources
 from relmm.learning.progress import read_metrics
 from relmm.policies.relmm.learner import ReLMMLearner
 from relmm.sim.env import RelmmRoomEnv
@@ -125,17 +125,17 @@ def test_an_episode_saved_while_the_replay_is_rebuilt_is_learned(
     episodes = summarize(data).episodes
     assert learned == [(index, True) for index in range(episodes)]
     learned.clear()
-    read = training_run.read_episodes
+    read = Sources.read_learned
 
-    def read_beside_a_recorder(root: Path) -> Any:
-        yield from read(root)
+    def read_beside_a_recorder(sources: Sources) -> Any:
+        yield from read(sources)
         shutil.copytree(data, tmp_path / "more")
         with DurableDataset.open(data, "me/life") as dataset:
             for frame in frames_of(tmp_path / "more"):
                 dataset.add_frame(*frame)
             dataset.save_episode()
 
-    monkeypatch.setattr(training_run, "read_episodes", read_beside_a_recorder)
+    monkeypatch.setattr(Sources, "read_learned", read_beside_a_recorder)
     call("--resume=true", f"--output_dir={following}", "--steps=5", "--policy.device=cpu")
     assert learned == [*((index, False) for index in range(episodes)), (episodes, True)]
     assert counters(following)["episodes"] == episodes + 1

@@ -19,6 +19,7 @@ FUNCTIONS = {
     "relmm-analyze": "analyze",
     "relmm-calibrate": "calibrate",
     "relmm-upload": "upload",
+    "relmm-serve": "serve",
 }
 CONFIGS = {TrainConfig: "relmm-train", EvalConfig: "relmm-eval", RecordConfig: "relmm-record"}
 KINDS = {
@@ -28,6 +29,7 @@ KINDS = {
     "relmm-analyze": ("--policy.type=relmm",),
     "relmm-calibrate": ("--robot.type=locobot",),
     "relmm-upload": (),
+    "relmm-serve": (),
 }
 
 

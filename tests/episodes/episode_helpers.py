@@ -58,6 +58,7 @@ def outcome(episode: int, step: int, length: int) -> dict:
         "complementary_info.phase": int(Phase(step % 4)),
         **{f"complementary_info.{name}": episode % 16 / 16 + step / 1024 + i for i, name in explained},
         "complementary_info.robot_time": 100 * episode + 0.5 * step,
+        "complementary_info.weights_step": -1,
     }
 
 
