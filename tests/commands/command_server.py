@@ -56,19 +56,22 @@ def become(request: dict) -> None:
     sys.argv = [request["command"], *request["arguments"]]
 
 
-for name in PRELOAD:
-    importlib.import_module(name)
-threads = {Path(f"/proc/self/task/{thread}/comm").read_text().strip() for thread in os.listdir("/proc/self/task")}
-assert len(threads - {"jemalloc_bg_thd"}) == 1, f"threads do not survive a fork, and there are {threads}"
-for line in sys.stdin.buffer:
-    request = json.loads(line)
-    child = os.fork()
-    if not child:
-        become(request)
-        break
-    print(wait_for(child, request["seconds"]), flush=True)
-else:
+def serve() -> str:
+    """Answer requests; in a child, the name of the script that it is to run."""
+    for name in PRELOAD:
+        importlib.import_module(name)
+    threads = {Path(f"/proc/self/task/{thread}/comm").read_text().strip() for thread in os.listdir("/proc/self/task")}
+    assert len(threads - {"jemalloc_bg_thd"}) == 1, f"threads do not survive a fork, and there are {threads}"
+    for line in sys.stdin.buffer:
+        request = json.loads(line)
+        child = os.fork()
+        if not child:
+            become(request)
+            return request["command"]
+        print(wait_for(child, request["seconds"]), flush=True)
     sys.exit()
 
-(script,) = entry_points(group="console_scripts", name=sys.argv[0])
-sys.exit(script.load()())
+
+if __name__ == "__main__":  # processes that a script spawns import this file, too
+    (script,) = entry_points(group="console_scripts", name=serve())
+    sys.exit(script.load()())

@@ -99,7 +99,7 @@ def test_record_of_cleaning_has_a_room_an_episode_and_goes_on_with_other_rooms(r
     assert [run["mode"] for run in json.loads((root / "meta/relmm.json").read_text())["runs"]] == ["clean"] * 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_record_stopped_by_signal_saves_and_finishes(tmp_path, number):
     root = tmp_path / "room"
     script = Path(sys.executable).parent / "relmm-record"
@@ -122,7 +122,7 @@ def test_record_stopped_by_signal_saves_and_finishes(tmp_path, number):
     assert summary.truncated + summary.ended_by_success == summary.episodes, "the cut-off episode is marked truncated"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL])
 def test_record_ended_before_its_first_episode_goes_on(run, tmp_path, number):
     root = tmp_path / "room"
     script = Path(sys.executable).parent / "relmm-record"

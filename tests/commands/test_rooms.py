@@ -98,7 +98,7 @@ def test_a_room_that_does_not_end_is_killed(rooms, tmp_path, monkeypatch):
     script.write_text(RECORDER.replace("sys.stdin.buffer.read()", "import time; time.sleep(1000)"))
     with rooms("--stays", count=1) as running:
         watch(running, lambda: starts(tmp_path))
-        (process,) = psutil.Process().children()
+        (process,) = (child for child in psutil.Process().children() if str(script) in child.cmdline())
     assert not process.is_running()
 
 

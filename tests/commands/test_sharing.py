@@ -219,6 +219,7 @@ def background(hub, monkeypatch):
     return Uploads(dataset_arguments("me/room", SAMPLE, True, "cc0-1.0"), SAMPLE, said.append), said
 
 
+@pytest.mark.slow
 def test_uploads_in_the_background(hub, fault, background):
     uploads, said = background
     hub.faults.append(fault("/repos/create", status=500))

@@ -23,6 +23,7 @@ def recorded(run_in, tmp_path_factory) -> Path:
     return folder / "room"
 
 
+@pytest.mark.slow
 def test_what_lerobot_record_has_recorded_can_be_learned_from(run, tmp_path):
     """At LeRobot's own frame rate, and without the columns that only relmm writes."""
     result = run(

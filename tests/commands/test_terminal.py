@@ -48,6 +48,7 @@ def test_an_evaluation_outlives_its_terminal(tmp_path):
     assert episodes(tmp_path) == 2
 
 
+@pytest.mark.slow
 def test_an_evaluation_outlives_the_pipe_that_it_tells_of_itself(tmp_path):
     reader, writer = os.pipe()
     os.close(reader)
@@ -59,7 +60,7 @@ def test_an_evaluation_outlives_the_pipe_that_it_tells_of_itself(tmp_path):
     assert episodes(tmp_path) == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGHUP, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_stopped_evaluation_keeps_what_it_has_measured(tmp_path, number):
     process = begin(
         tmp_path, *EVALUATE, "--env.navigation_steps=8", "--eval.n_episodes=1000", stdout=-1, stderr=-1, text=True

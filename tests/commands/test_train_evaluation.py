@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import av
+import pytest
 
 from relmm.commands.policies import make_actor
 from relmm.commands.train_config import TrainEvalConfig
@@ -35,6 +36,7 @@ def test_a_stopped_evaluation_has_no_scores_and_a_whole_film(tmp_path):
         assert sum(1 for _ in film.decode(video=0)) > 1
 
 
+@pytest.mark.slow
 def test_a_hangup_during_an_evaluation_ends_the_run_with_its_checkpoint(tiny, tmp_path):
     options = ("--steps=1", "--env_eval_freq=1", "--eval.n_episodes=100", "--eval.n_videos=1", "--output_dir=out")
     command = [str(Path(sys.executable).parent / "relmm-train"), *tiny, *options]

@@ -49,6 +49,7 @@ def test_the_pace_is_that_of_late():
         assert bar.seconds_left() == pytest.approx(500 * 2.0, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_run_ends_at_all_of_everything(run, tiny, tmp_path):
     evaluations = ("--env_eval_freq=2", "--eval.n_episodes=1")
     result = run("relmm-train", *tiny, *evaluations, "--steps=2", "--output_dir=out")

@@ -108,7 +108,7 @@ def test_summary_counts_what_is_on_disk(tmp_path):
     new_dataset(tmp_path / "d", 4)  # 3 + 4 + 5 + 6 frames; step % 3 == 1 grasps, step % 6 == 1 succeeds
     summary = summarize(tmp_path / "d")
     assert (summary.episodes, summary.frames) == (4, 18)
-    assert list(summary.frames_by_phase.values()) == [6, 5, 4, 3]
+    assert list(summary.frames_by_phase.values()) == [6, 5, 4, 3, 0]
     assert (summary.grasps, summary.successful_grasps) == (6, 4)
     assert (summary.ended_by_success, summary.truncated) == (2, 2)
     assert summary.seconds == 9.0

@@ -190,8 +190,9 @@ def test_forward_forgets_steps_that_wait_in_vain(make_policy: MakePolicy, as_bat
 def frames_of(policy: RelmmPaperPolicy, **settings: Any) -> list[dict[str, Any]]:
     deltas = [delta / FPS for delta in policy.config.observation_delta_indices]
     columns = {IMAGE_KEY: deltas, "action": deltas}
+    driving = list(range(57, 70))  # episodes after the curriculum
     dataset = LeRobotDataset(
-        "local/diverse", root=RECORDED, delta_timestamps=columns, episodes=[0, 1, 2], return_uint8=False, **settings
+        "local/sample", root=RECORDED, delta_timestamps=columns, episodes=driving, return_uint8=False, **settings
     )
     return list(dataset)
 
