@@ -20,7 +20,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from relmm.episodes import DurableDataset, compact
 from relmm.episodes.settings import LEROBOT_COLUMNS
-from relmm.features import IMAGE_KEY
+from relmm.features import IMAGE_KEY, outcome_features
 
 SAMPLE = Path(__file__).parents[1] / "datasets" / "first_attempts"
 OUTPUT = Path(__file__).parent / "results" / "long_life.csv"
@@ -32,7 +32,7 @@ def sample_frames() -> list[dict[str, Any]]:
     sample = LeRobotDataset("local/sample", root=SAMPLE)
     frames = []
     for item in sample:
-        frame = {}
+        frame = {key: np.zeros(1, feature["dtype"]) for key, feature in outcome_features().items()}  # of newer columns
         for key, feature in sample.features.items():
             if key not in LEROBOT_COLUMNS and key != IMAGE_KEY:
                 frame[key] = item[key].numpy().reshape(feature["shape"])
