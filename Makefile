@@ -39,7 +39,7 @@ demo: $(STAMP) ## a robot learns to clean a room from scratch, then shows it (so
 	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/000000/pretrained_model --env.room=no_obstacles \
 	  --env.navigation_steps=30 --eval.n_episodes=1 --seed=0 --output_dir=$(DEMO_DIR)/before
 	$(BIN)/relmm-eval --policy.path=$(DEMO_DIR)/train/checkpoints/last/pretrained_model --env.room=no_obstacles \
-	  --eval.n_episodes=2 --seed=0 --output_dir=$(DEMO_DIR)/after
+	  --eval.n_episodes=1 --seed=0 --output_dir=$(DEMO_DIR)/after
 	@$(BIN)/python -m relmm.commands.demo $(DEMO_DIR)/before $(DEMO_DIR)/after $(DEMO_DIR)/before_and_after.mp4
 
 sample: $(STAMP) ## make the dataset of datasets/ again, in outputs/sample/first_attempts (some minutes)
