@@ -108,7 +108,7 @@ def kill_again_and_again(mode: str, kills: int, folder: Path) -> dict[str, objec
     if mode == "followed":
         recorder = FORKS.Process(target=record_slowly, args=(root,))
         recorder.start()
-    source = ROBOT if mode == "own" else [f"--dataset.follow={root}"]
+    source = ROBOT if mode == "own" else [f"--dataset.follow={root}", "--dataset.max_waiting=100000"]
     begin = [*source, *LEARN, f"--output_dir={run}"]
     resume = ["--resume=true", f"--output_dir={run}", "--policy.device=cpu"]
     last, wrong = run / "checkpoints" / "last", 0
