@@ -9,7 +9,6 @@ benchmarks/results/analysis_speed.csv.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import resource
@@ -22,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from csv_table import append_row
 
 from relmm.episodes.folder import DATA_FILES, EPISODE_FILES, INFO, DatasetFolder
 from relmm.episodes.info import DATA_PATH
@@ -93,12 +93,7 @@ def main() -> None:
     row |= {"policy": bool(arguments.policy), **result, "report_mb": round(size, 2)}
     print(row)
     path = ROOT / "benchmarks/results/analysis_speed.csv"
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
+    append_row(row, path)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ The emulator takes commands every 20 ms, which is part of each time, and so is w
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import signal
 import subprocess
@@ -20,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from csv_table import write_table
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "base_faults.csv"
@@ -111,10 +111,7 @@ def main() -> None:
             }
         )
         print(", ".join(f"{key} {value}" for key, value in rows[-1].items()), flush=True)
-    with RESULTS.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, RESULTS)
 
 
 if __name__ == "__main__":

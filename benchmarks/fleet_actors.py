@@ -12,7 +12,6 @@ the learner `relmm-train --dataset.follow`. Prints a line for each number of act
 from __future__ import annotations
 
 import argparse
-import csv
 import hashlib
 import json
 import os
@@ -28,6 +27,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import psutil
+from csv_table import append_row
 
 from relmm.episodes.folder import EPISODE_FILES, INFO, RELMM, TASKS, DatasetFolder
 from relmm.errors import FleetError
@@ -304,12 +304,7 @@ def main() -> None:
     for actors in arguments.actors:
         line = scale(arguments.recording, actors, arguments.rate, arguments.seconds)
         print(line, flush=True)
-        new = not arguments.csv.exists()
-        with arguments.csv.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(line))
-            if new:
-                writer.writeheader()
-            writer.writerow(line)
+        append_row(line, arguments.csv)
 
 
 if __name__ == "__main__":

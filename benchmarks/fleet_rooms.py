@@ -9,7 +9,6 @@ each N, and appends it to a CSV.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import signal
 import tempfile
@@ -17,6 +16,7 @@ import time
 from pathlib import Path
 
 import psutil
+from csv_table import append_row
 from fleet_actors import start, wait_until
 
 from relmm.episodes import saved_episodes, summarize
@@ -80,12 +80,7 @@ def main() -> None:
     for rooms in arguments.rooms:
         line = measure(rooms, arguments.seconds)
         print(line, flush=True)
-        new = not arguments.csv.exists()
-        with arguments.csv.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(line))
-            if new:
-                writer.writeheader()
-            writer.writerow(line)
+        append_row(line, arguments.csv)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from csv_table import write_table
 from fuzz_damage import damaged, damaged_arguments
 from fuzz_targets import COMMANDS, FILES, SLOWNESS, Healthy, parse, prepare
 
@@ -57,10 +58,7 @@ def main() -> None:
     rows["all"] = {**total, "slowest_s": max(row["slowest_s"] for row in rows.values())}
     print(" | ".join(str(value) for value in rows["all"].values()))
     if options.csv:
-        with Path(options.csv).open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, _COLUMNS)
-            writer.writeheader()
-            writer.writerows(rows.values())
+        write_table(rows.values(), Path(options.csv), _COLUMNS)
     sys.exit(rows["all"]["tracebacks"] > 0)
 
 

@@ -13,12 +13,12 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"  # read when numpy is imported
 
 import argparse
-import csv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from csv_table import write_table
 from tqdm import tqdm
 
 import relmm.plugin  # noqa: F401
@@ -130,11 +130,7 @@ def main() -> None:
                         flush=True,
                     )
                 rows += new
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    with arguments.output.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, arguments.output)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ Finished trainings and evaluations are kept in --output and not run again.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -21,6 +20,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from csv_table import write_table
 
 from relmm.learning.progress import read_metrics
 
@@ -108,10 +109,7 @@ def main() -> None:
     rows = [row for seed in arguments.seeds for row in compare(seed, arguments.steps, arguments.output)]
     for row in rows:
         print(", ".join(f"{key} {value}" for key, value in row.items()))
-    with RESULTS.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, RESULTS)
 
 
 if __name__ == "__main__":

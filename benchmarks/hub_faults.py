@@ -8,7 +8,6 @@ uploads and in the last one. Then the Hub is well again, and the command that th
 
 from __future__ import annotations
 
-import csv
 import importlib.util
 import os
 import shlex
@@ -21,14 +20,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from csv_table import write_table
+
 from relmm.episodes import summarize
 
 HERE = Path(__file__).parent
 STEPS = 12
 TINY = (
     "--robot.type=locobot_sim --policy.device=cpu --policy.num_stationary=6 --policy.min_attempts_to_update=4 "
-    "--policy.min_steps_to_update=4 --policy.navigation_batch_size=8 --policy.grasp_batch_size=8 "
-    "--policy.random_steps=2 --pseudo_reset_steps=2 --replay_frames=2000 --env_eval_freq=0 --save_freq=4 --max_steps=3 "
+    "--policy.batch_size=8 --pseudo_reset_steps=2 --replay_frames=2000 --env_eval_freq=0 --save_freq=4 --max_steps=3 "
     f"--steps={STEPS} --hub.every=4 --policy.push_to_hub=true --policy.repo_id=me/policy --dataset.push_to_hub=true "
     "--dataset.repo_id=me/life"
 ).split()
@@ -72,11 +72,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             rows.append({"fault": name, **run_with(hub, break_hub, Path(folder))})
         print(" | ".join(str(value) for value in rows[-1].values()), flush=True)
-    target = HERE / "results" / "hub_faults.csv"
-    with target.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, HERE / "results" / "hub_faults.csv")
 
 
 def run_with(hub: Any, break_hub: Callable[[Any], None], folder: Path) -> dict[str, Any]:

@@ -10,7 +10,6 @@ new dataset is begun.
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import os
 import select
@@ -23,6 +22,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from csv_table import write_table
 
 REPO_ID = "benchmark/kills"
 ROUNDS_PER_DATASET = 10
@@ -122,17 +122,13 @@ def run(kills: int, seed: int, output: Path) -> bool:
         rows.append(row)
         print(f"{number + 1}/{kills}: acknowledged {acknowledged}, readable {readable}", file=sys.stderr, flush=True)
     shutil.rmtree(folder)
-    write_table(rows, output)
+    save(rows, output)
     return not any(row["unreadable"] for row in rows)
 
 
-def write_table(rows: list[dict[str, float]], output: Path) -> None:
+def save(rows: list[dict[str, float]], output: Path) -> None:
     """Write a row a kill as CSV, counting whole datasets, and print the sums, counting each episode once."""
-    output.parent.mkdir(parents=True, exist_ok=True)
-    with output.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, output)
     new = [sum(row[key] - row["before"] for row in rows) for key in ("acknowledged", "readable")]
     sums = [*new, sum(row["unreadable"] for row in rows)]
     print("kills  episodes acknowledged before the kill  readable after  unreadable")

@@ -9,7 +9,6 @@ counts its steps, four an attempt, so a checkpoint tells whether it has learned 
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import json
 import multiprocessing
@@ -23,6 +22,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
+from csv_table import write_table
 from long_life import sample_frames
 from safetensors.torch import load_file
 
@@ -152,10 +152,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             rows.append(kill_again_and_again(mode, kills, Path(folder)))
         print(", ".join(f"{key} {value}" for key, value in rows[-1].items()), flush=True)
-    with OUTPUT.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, OUTPUT)
 
 
 if __name__ == "__main__":

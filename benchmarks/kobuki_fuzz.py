@@ -11,7 +11,6 @@ adapter loses bytes, but does not flip any.
 from __future__ import annotations
 
 import argparse
-import csv
 import random
 import struct
 import time
@@ -19,6 +18,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+from csv_table import write_table
 
 from relmm.robot.hardware.kobuki_protocol import Feedback, FrameReader, decode, frame
 
@@ -131,10 +132,7 @@ def main() -> None:
     rows = [fuzz(kind, round(arguments.megabytes * 1e6 / len(KINDS))) for kind in KINDS]
     for row in rows:
         print(", ".join(f"{key} {value}" for key, value in row.items()))
-    with RESULTS.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, RESULTS)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from csv_table import write_table
 
 from relmm.learning.progress import read_metrics
 
@@ -107,11 +108,7 @@ def save(rows: list[dict[str, Any]], path: Path) -> None:
     kept = [row for row in load(path) if (row["run"], row["seed"]) not in new]
     everything = [*kept, *rows]
     everything.sort(key=lambda row: (list(RUNS).index(row["run"]), int(row["seed"]), int(row["step"])))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(everything)
+    write_table(everything, path, COLUMNS)
 
 
 def load(path: Path) -> list[dict[str, str]]:

@@ -8,7 +8,6 @@ Frames are those of the sample dataset, over and over, in episodes of 13, as in 
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import tempfile
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from csv_table import write_table
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from relmm.episodes import DurableDataset, compact
@@ -83,10 +83,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         row = measure(arguments.frames, Path(folder) / "life")
     print(", ".join(f"{key} {value}" for key, value in row.items()))
-    with OUTPUT.open("w", newline="") as file:
-        writer = csv.DictWriter(file, row)
-        writer.writeheader()
-        writer.writerow(row)
+    write_table([row], OUTPUT)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from baselines import evaluate
+from csv_table import write_table
 from lerobot.configs.policies import PreTrainedConfig
 
 import relmm.plugin  # noqa: F401
@@ -94,10 +95,7 @@ def save(rows: list[dict[str, str]]) -> list[dict[str, str]]:
         with RESULTS.open(newline="") as file:
             rows = [*(row for row in csv.DictReader(file) if row["room"] not in new), *rows]
     rows.sort(key=lambda row: list(ROOMS).index(row["room"]))
-    with RESULTS.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, RESULTS, COLUMNS)
     return rows
 
 

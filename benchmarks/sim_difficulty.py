@@ -25,7 +25,6 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"  # read when numpy is imported
 
 import argparse
-import csv
 import logging
 import math
 from collections.abc import Iterable
@@ -34,6 +33,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from csv_table import write_table
 from numpy.typing import NDArray
 from privileged_controller import PICK_UPS_PER_STEP, Controller, graspable
 from tqdm import tqdm
@@ -295,11 +295,7 @@ def main() -> None:
 
 def save(rows: list[dict[str, str | int | float]], path: Path) -> None:
     """Write the table as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, path)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"  # read when numpy is imported
 
 import argparse
-import csv
 import itertools
 import platform
 import tempfile
@@ -26,6 +25,7 @@ from unittest.mock import patch
 
 import mujoco
 import numpy as np
+from csv_table import write_table
 from tqdm import tqdm
 
 from relmm.episodes import EpisodeRecorder
@@ -208,11 +208,7 @@ def show(rows: list[dict[str, Any]]) -> None:
 
 def save(rows: list[dict[str, Any]], path: Path) -> None:
     """Write the table as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    write_table([{k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()} for row in rows], path)
 
 
 def main() -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from csv_table import write_table
 from lerobot.configs.policies import PreTrainedConfig
 from privileged_controller import Controller
 
@@ -94,10 +95,7 @@ def main() -> None:
             pace = np.mean([each["steps_per_object"] for each in new])
             print(f"{who:28}{room:16}{share:7.1%} collected, {pace:5.2f} steps an object", flush=True)
         env.close()
-        with arguments.output.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(rows)
+        write_table(rows, arguments.output, COLUMNS)
 
 
 if __name__ == "__main__":

@@ -13,13 +13,13 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"  # read when numpy is imported
 
 import argparse
-import csv
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
+from csv_table import write_table
 from grasp_learning import POLICIES, make_policy
 from numpy.typing import NDArray
 
@@ -131,11 +131,7 @@ def main() -> None:
     rows = [measure(name, seen) for name in arguments.policies]
     for row in rows:
         print(", ".join(f"{key} {value}" for key, value in row.items()))
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    with arguments.output.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(rows, arguments.output)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What `import relmm` offers, as a user's own script uses it; and the scripts and the package in examples/."""
 
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -86,7 +87,8 @@ def test_grasps_beside_what_a_policy_expects_of_them(checkpoint):
 @pytest.mark.slow
 def test_a_package_with_a_room_of_its_own(tmp_path):
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*pip, "--target", tmp_path / "site", EXAMPLES / "own_room"], check=True, cwd=tmp_path)
+    package = shutil.copytree(EXAMPLES / "own_room", tmp_path / "own_room")  # pip builds where the package lies
+    subprocess.run([*pip, "--target", tmp_path / "site", package], check=True, cwd=tmp_path)
     evaluate = [Path(sys.executable).parent / "relmm-eval", "--policy.type=relmm_random", "--env.room=kitchen"]
     done = subprocess.run(
         [*evaluate, "--env.navigation_steps=2", "--eval.n_episodes=1", "--eval.n_videos=0", "--output_dir=out"],

@@ -44,12 +44,12 @@ class DisplayOptions:
         elsewhere = (self.display_ip, self.display_port)
         if not self.display_data:
             if self.display_path is not None or elsewhere != (None, None):
-                raise ConfigError("Something says where to display, but nothing is: also say --display_data=true.")
+                raise ConfigError("--display_path, --display_ip and --display_port need --display_data=true: add it.")
             return
         if find_spec("rerun") is None:
             raise ConfigError("--display_data=true needs rerun: pip install 'lerobot_policy_relmm[viz]'.")
         if (self.display_ip is None) != (self.display_port is None):
-            raise ConfigError("A viewer elsewhere has both: say --display_ip=ADDRESS and --display_port=PORT.")
+            raise ConfigError("A remote viewer needs both --display_ip=ADDRESS and --display_port=PORT.")
         if self.display_path is not None:
             self._check_file(self.display_path)
         elif self.display_ip is None and not _has_screen():
@@ -60,7 +60,7 @@ class DisplayOptions:
 
     def _check_file(self, path: Path) -> None:
         if self.display_ip is not None:
-            raise ConfigError("Say either --display_path or --display_ip and --display_port: there is one display.")
+            raise ConfigError("Choose one: --display_path, or --display_ip and --display_port.")
         if path.suffix != ".rrd":
             raise ConfigError(f"display_path is {path}, but the viewer opens files that end in .rrd: rename it.")
         if path.exists():

@@ -9,16 +9,18 @@ import os
 import shlex
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO
 
+from relmm.commands.background import BackgroundCommand, last_line
 from relmm.commands.train_config import TrainConfig
 from relmm.episodes.folder import INFO
 from relmm.episodes.remote import reserve
 from relmm.errors import HubError
 from relmm.learning.untrusted import CONFIG
+
+_MODULE, _PREFIX = "relmm.commands.upload", "relmm-upload: "
+_QUIET = {"HF_HUB_DISABLE_PROGRESS_BARS": "1", "OMP_NUM_THREADS": "1"}
 
 
 class Uploads:
@@ -33,38 +35,25 @@ class Uploads:
     def __init__(self, arguments: list[str], folder: Path, say: Callable[[str], None] = print) -> None:
         self.say = say
         self._arguments, self._folder = arguments, folder
-        self._process: subprocess.Popen[bytes] | None = None
-        self._errors: IO[bytes] | None = None
+        self._upload: BackgroundCommand | None = None
 
     def begin(self) -> None:
         """Upload in the background what is there now, unless the last upload is still under way."""
         self.check()
         if not self._arguments:
             return
-        if self._process is not None:
+        if self._upload is not None:
             self.say("upload: the last one is still under way; the next one takes what is new by then.")
             return
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed in `check`
-        # In a session of its own, where a Ctrl-C that is meant for the run does not reach it.
-        self._process = subprocess.Popen(
-            _command([*self._arguments, "--background=true"]),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-            env=_environment(),
-            start_new_session=True,
-        )
+        self._upload = BackgroundCommand([_MODULE, *self._arguments, "--background=true"], **_QUIET)
 
     def check(self) -> None:
         """Say it if an upload has failed since."""
-        if self._process is None or self._process.poll() is None:
+        if self._upload is None or self._upload.running:
             return
-        assert self._errors is not None
-        self._errors.seek(0)
-        if self._process.returncode != 0:
-            self.say(f"upload: {_last_line(self._errors.read())} The run goes on; the next upload tries again.")
-        self._errors.close()
-        self._process = self._errors = None
+        if problem := self._upload.problem():
+            self.say(f"upload: {problem.removeprefix(_PREFIX)} The run goes on; the next upload tries again.")
+        self._upload = None
 
     def finish(self) -> None:
         """Upload what there is, and wait for it.
@@ -80,37 +69,23 @@ class Uploads:
         self.say("Uploading to the Hub; Ctrl-C leaves it for later.")
         try:
             result = subprocess.run(
-                _command(self._arguments),
+                [sys.executable, "-m", _MODULE, *self._arguments],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
-                env=_environment(),
+                env={**os.environ, **_QUIET},
                 check=False,
             )
         except KeyboardInterrupt:
             raise HubError(f"the upload was stopped. {later}") from None
         if result.returncode != 0:
-            raise HubError(f"{_last_line(result.stderr)} {later}")
+            raise HubError(f"{last_line(result.stderr).removeprefix(_PREFIX)} {later}")
         self.say(result.stdout.decode().strip())
 
     def _stop(self) -> None:
         """End an upload in the background: what it would have sent is in the last one."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.wait()
-            self._process = None
-
-
-def _command(arguments: list[str]) -> list[str]:
-    return [sys.executable, "-m", "relmm.commands.upload", *arguments]
-
-
-def _environment() -> dict[str, str]:
-    return {**os.environ, "HF_HUB_DISABLE_PROGRESS_BARS": "1", "OMP_NUM_THREADS": "1"}
-
-
-def _last_line(errors: bytes) -> str:
-    lines = errors.decode(errors="replace").strip().splitlines() or ["it has ended without a word."]
-    return lines[-1].removeprefix("relmm-upload: ")
+        if self._upload is not None:
+            self._upload.stop()
+            self._upload = None
 
 
 def _options(**values: object) -> list[str]:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from relmm.robot.locobot import LocobotRobot
 from relmm.teleoperator.locobot_keyboard import HELP, TAKE_OVER, LocobotKeyboard
 
-_POLL_S = 0.1  # of our time between looks at the keyboard
-_WATCH_S = 0.02  # of the robot's time that passes with each, so that its body is watched
+_POLL_S = 0.1  # between looks at the keyboard
+_WATCH_S = 0.02  # on the robot's clock, for its body to be watched between two of them
 
 
 class TakeOver:
@@ -30,17 +30,16 @@ class TakeOver:
     def __call__(self) -> dict[str, float] | None:
         """Their next action; None if nobody has taken over, or when they give back."""
         while self._keyboard.taken_over and not self._stopped():
-            self._tell(True, f"You have taken over: {HELP}. {TAKE_OVER} gives back.")
+            if not self._driving:
+                self._driving = True
+                self._say(f"You have taken over: {HELP}. {TAKE_OVER} gives back.")
             if (action := self._keyboard.next_action()) is not None:
                 self._robot.skills.forget_picture()  # they may have moved things
                 return action
             self._keyboard.wait(_POLL_S)
             self._robot.body.wait(_WATCH_S)
-        self._tell(False, "The robot goes on by itself.")
-        self._robot.skills.forget_picture()
+        if self._driving:
+            self._driving = False
+            self._say("The robot goes on by itself.")
+            self._robot.skills.forget_picture()
         return None
-
-    def _tell(self, driving: bool, words: str) -> None:
-        if driving != self._driving:
-            self._say(words)
-        self._driving = driving

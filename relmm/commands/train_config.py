@@ -35,8 +35,7 @@ class TrainDatasetConfig:
         init: a dataset (folder, or user/name on the Hub) to fill the replay with and train on first.
         follow: datasets that other processes are recording, or folders of such datasets, with commas between them;
             there is no robot then.
-        max_waiting: episodes of these that may wait for the learner; what comes while more do is remembered, but
-            without updates of its own.
+        max_waiting: while more episodes of these than this wait for the learner, new ones are stored without updates.
         push_to_hub: upload it to `repo_id` at the end, and every `hub.every` steps.
         private: whether a new repository is private; None for the owner's default.
         license: for its card, an identifier of the Hub.

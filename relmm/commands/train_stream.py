@@ -14,7 +14,7 @@ from relmm.commands.training_run import Run
 from relmm.episodes import Episode
 from relmm.episodes.sources import Sources
 from relmm.errors import ConfigError
-from relmm.learning.checkpoint import pretrained_model, read_cursors
+from relmm.learning.checkpoint import checkpoint_folders, pretrained_model, read_cursors
 from relmm.learning.intake import Intake
 
 _POLL_S = 0.5  # between looks at the datasets
@@ -111,19 +111,30 @@ class _Checkpoints:
     def __init__(self, run: Run, sources: Sources) -> None:
         self._run, self._sources = run, sources
         self._kept_at, self._passing = -1, list[Path]()
+        for folder in checkpoint_folders(run.config.checkpoints):  # of before a resume
+            self._note(folder, int(folder.name))
 
     def save(self) -> None:
         """Write one, and remove what is no longer needed."""
         cursors = [source.cursor for source in self._sources.all]
         runs = [first for cursor in cursors for first in cursor.runs[:1]]
-        folder = self._run.save(sum(cursor.episodes for cursor in cursors), runs, cursors)
-        period = self._run.progress.steps // self._run.config.save_freq
-        if period > self._kept_at:
-            self._kept_at = period
-        elif folder not in self._passing:
-            self._passing.append(folder)
+        step = self._run.progress.steps
+        folder = self._run.save(
+            sum(cursor.episodes for cursor in cursors), runs, cursors, passing=self._period(step) <= self._kept_at
+        )
+        self._note(folder, step)
         while len(self._passing) > _PASSING:
             shutil.rmtree(self._passing.pop(0))
+
+    def _period(self, step: int) -> int:
+        return step // self._run.config.save_freq
+
+    def _note(self, folder: Path, step: int) -> None:
+        """The first of each period is kept."""
+        if self._period(step) > self._kept_at:
+            self._kept_at = self._period(step)
+        elif folder not in self._passing:
+            self._passing.append(folder)
 
 
 def _words(sources: Sources) -> str:

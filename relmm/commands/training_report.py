@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import IO
 
 from relmm.analysis.page import write_page
+from relmm.commands.background import BackgroundCommand
 from relmm.commands.cli import progress
 
 _PAUSE = 20  # times as long as the last one took until the next one begins: at most 5 % of one processor
@@ -31,47 +27,32 @@ class TrainingReport:
     def __init__(self, root: Path, name: str, page: Path, say: Callable[[str], None] = print) -> None:
         self.say = say
         self._root, self._name, self._page = root, name, page
-        self._process: subprocess.Popen[bytes] | None = None
-        self._errors: IO[bytes] | None = None
+        self._making: BackgroundCommand | None = None
         self._begun = self._next = 0.0
 
     def refresh(self) -> None:
         """Begin a new one in the background, unless the last one is too fresh."""
         self.check()
-        if self._process is not None or time.monotonic() < self._next:
+        if self._making is not None or time.monotonic() < self._next:
             return
         self._begun = time.monotonic()
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed in `check`
-        # In a session of its own, where a Ctrl-C that is meant for the run does not reach it.
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "relmm.analysis.page", str(self._root), self._name, str(self._page)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-            start_new_session=True,
-        )
+        self._making = BackgroundCommand(["relmm.analysis.page", str(self._root), self._name, str(self._page)])
 
     def check(self) -> None:
         """See whether one is ready, and say it if it has failed."""
-        if self._process is None or self._process.poll() is None:
+        if self._making is None or self._making.running:
             return
-        assert self._errors is not None
         now = time.monotonic()
         self._next = now + _PAUSE * (now - self._begun)
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        if self._process.returncode != 0:
-            self._say_failed(lines[-1] if lines else "it has ended without a word")
-        self._errors.close()
-        self._process = self._errors = None
+        if problem := self._making.problem():
+            self._say_failed(problem)
+        self._making = None
 
     def finish(self) -> None:
         """Make the last one, of all there is, and wait for it."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.wait()
-            self._process = None
+        if self._making is not None:
+            self._making.stop()
+            self._making = None
         try:
             self._write()
             self.say(f"report: {self._page}")

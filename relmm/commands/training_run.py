@@ -130,7 +130,13 @@ class Run:
                 episodes = episode.index + 1
         return episodes
 
-    def save(self, episodes: int, runs: list[dict[str, Any]] | None = None, sources: Sequence[Cursor] = ()) -> Path:
+    def save(
+        self,
+        episodes: int,
+        runs: list[dict[str, Any]] | None = None,
+        sources: Sequence[Cursor] = (),
+        passing: bool = False,
+    ) -> Path:
         """Write a checkpoint; its folder.
 
         Args:
@@ -138,6 +144,7 @@ class Run:
                 learns the later ones.
             runs: with what they were recorded; None for those of the run's own dataset.
             sources: how far each dataset of others has been learned from.
+            passing: it is for those who act, will soon be removed, and is not tracked.
         """
         counters = {"episodes": episodes, "interventions": self.progress.interventions}
         checkpoint = save_checkpoint(
@@ -151,7 +158,7 @@ class Run:
             recorded_runs(DatasetFolder(self.data)) if runs is None else runs,
             sources,
         )
-        if self._tracker is not None:
+        if self._tracker is not None and not passing:
             self._tracker.log_checkpoint(checkpoint)
         if self._report is not None and episodes:
             self._report.refresh()

@@ -140,6 +140,11 @@ def last_checkpoint(folder: Path, running: bool = False) -> Path:
     return last.resolve()
 
 
+def checkpoint_folders(folder: Path) -> list[Path]:
+    """The checkpoints in a run's `checkpoints` folder, by step; none if there is no such folder."""
+    return sorted((path for path in folder.glob("*") if path.name.isdecimal()), key=lambda path: int(path.name))
+
+
 def pretrained_model(checkpoint: Path) -> Path:
     """The folder of a checkpoint that `--policy.path` takes."""
     return checkpoint / _MODEL

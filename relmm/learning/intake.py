@@ -13,15 +13,15 @@ _SAVING_SHARE = 0.1  # of a learner's time, at most, that goes into weights for 
 
 
 class Intake:
-    """Lets a learner take recorded episodes; where too many wait, it remembers them and makes fewer updates.
+    """Feeds recorded episodes to a learner; while too many wait, they are stored without updates.
 
-    So those who act never wait for a slow learner, its memory is of the present, and no episode is lost to it.
+    Robots never wait for a slow learner, its replay stays recent, and no episode is lost.
 
     Args:
         learner: takes them.
         progress: counts their frames.
         waiting: how many episodes are saved and not read yet.
-        max_waiting: of which above this number are remembered without updates of their own.
+        max_waiting: while more episodes than this wait, new ones are stored without updates.
         clock: s.
     """
 

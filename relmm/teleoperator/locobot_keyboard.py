@@ -5,13 +5,11 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.teleoperators.utils import TeleopEvents
 from lerobot.utils.keyboard_input import create_key_listener
 
 from relmm.errors import RobotError
 from relmm.features import (
-    ACTION_NAMES,
     BASKET_XY,
     GRASP_X,
     GRASP_Y,
@@ -20,8 +18,8 @@ from relmm.features import (
     Skill,
     action_dict,
 )
-from relmm.robot.locobot import LocobotRobot
 from relmm.teleoperator.config_locobot_keyboard import LocobotKeyboardConfig
+from relmm.teleoperator.locobot_teleoperator import LocobotTeleoperator
 
 TAKE_OVER = "t"
 HELP = (
@@ -33,7 +31,7 @@ _DRIVES = {"w": (1.0, 0.0), "a": (0.0, 1.0), "d": (0.0, -1.0), "W": (0.25, 0.0),
 _ROWS, _COLUMNS = 3, 3  # of the numeric keypad: 7 is far and left
 
 
-class LocobotKeyboard(Teleoperator):
+class LocobotKeyboard(LocobotTeleoperator):
     """Keys are read from the terminal, or on a desktop with X11 from anywhere, by LeRobot's own listener.
 
     Of keys that come while a skill runs, the last one counts.
@@ -51,30 +49,9 @@ class LocobotKeyboard(Teleoperator):
         self.taken_over = False
 
     @property
-    def action_features(self) -> dict[str, Any]:
-        """The robot's."""
-        return dict.fromkeys(ACTION_NAMES, float)
-
-    @property
-    def feedback_features(self) -> dict[str, Any]:
-        """None."""
-        return {}
-
-    @property
     def is_connected(self) -> bool:
         """Whether it listens."""
         return self._listener is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Always."""
-        return True
-
-    def calibrate(self) -> None:
-        """Nothing to do."""
-
-    def configure(self) -> None:
-        """Nothing to do."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Begin to listen.
@@ -116,14 +93,8 @@ class LocobotKeyboard(Teleoperator):
             return action_dict(x_vel=forward * MAX_X_VEL, theta_vel=left * MAX_THETA_VEL)
         if key == "0":
             return action_dict(Skill.PLACE, x=BASKET_XY[0], y=BASKET_XY[1])
-        robots = LocobotRobot.connected()
-        if len(robots) != 1:
-            raise RobotError(
-                f"locobot_keyboard needs exactly one connected LoCoBot in this process, but there are {len(robots)}: "
-                "use it with --robot.type=locobot or locobot_sim."
-            )
         x, y = keypad_place(int(key))
-        return action_dict(Skill.PLACE if robots[0].skills.holding else Skill.GRASP, x=x, y=y)
+        return action_dict(Skill.PLACE if self.robot().skills.holding else Skill.GRASP, x=x, y=y)
 
     def get_action(self) -> dict[str, float]:
         """What the last key asks for; without one the robot stands still for a navigation step.
@@ -138,9 +109,6 @@ class LocobotKeyboard(Teleoperator):
     def get_teleop_events(self) -> dict[TeleopEvents, bool]:
         """LeRobot's events: whether the person has taken over."""
         return {**dict.fromkeys(TeleopEvents, False), TeleopEvents.IS_INTERVENTION: self.taken_over}
-
-    def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Nothing to do."""
 
     def disconnect(self) -> None:
         """Leave the keyboard to others."""

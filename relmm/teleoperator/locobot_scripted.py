@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from lerobot.teleoperators.teleoperator import Teleoperator
 
 from relmm.errors import RobotError
 from relmm.features import (
@@ -17,11 +14,11 @@ from relmm.features import (
 )
 from relmm.policies.scripted.configuration_scripted import RelmmScriptedConfig
 from relmm.policies.scripted.modeling_scripted import RelmmScriptedPolicy
-from relmm.robot.locobot import LocobotRobot
 from relmm.teleoperator.config_locobot_scripted import LocobotScriptedConfig
+from relmm.teleoperator.locobot_teleoperator import LocobotTeleoperator
 
 
-class LocobotScripted(Teleoperator):
+class LocobotScripted(LocobotTeleoperator):
     """Looks through the eyes of the LoCoBot that is connected in this process, as a person beside it would."""
 
     config_class = LocobotScriptedConfig
@@ -33,30 +30,9 @@ class LocobotScripted(Teleoperator):
         self._policy: RelmmScriptedPolicy | None = None
 
     @property
-    def action_features(self) -> dict[str, Any]:
-        """The robot's."""
-        return dict.fromkeys(ACTION_NAMES, float)
-
-    @property
-    def feedback_features(self) -> dict[str, Any]:
-        """None."""
-        return {}
-
-    @property
     def is_connected(self) -> bool:
         """Whether `connect` was called."""
         return self._policy is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Always."""
-        return True
-
-    def calibrate(self) -> None:
-        """Nothing to do."""
-
-    def configure(self) -> None:
-        """Nothing to do."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Start the controller."""
@@ -72,21 +48,12 @@ class LocobotScripted(Teleoperator):
         """
         if self._policy is None:
             raise RobotError(f"{self} is not connected: call connect() first.")
-        robots = LocobotRobot.connected()
-        if len(robots) != 1:
-            raise RobotError(
-                f"locobot_scripted needs exactly one connected LoCoBot in this process, but there are {len(robots)}: "
-                "use it with --robot.type=locobot_sim."
-            )
-        observation = robots[0].get_observation()
+        observation = self.robot().get_observation()
         batch = {
             IMAGE_KEY: torch.from_numpy(observation[FRONT]).permute(2, 0, 1)[None] / 255,
             STATE_KEY: torch.tensor([[observation[name] for name in STATE_NAMES]]),
         }
         return dict(zip(ACTION_NAMES, self._policy.select_action(batch)[0].tolist(), strict=True))
-
-    def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Nothing to do."""
 
     def disconnect(self) -> None:
         """Stop the controller."""

@@ -28,11 +28,11 @@ def no_screen(monkeypatch):
     ("options", "words"),
     [
         ({"display_data": True}, "no screen here to display on: say --display_path=FILE.rrd"),
-        ({"display_path": "life.rrd"}, "also say --display_data=true"),
+        ({"display_path": "life.rrd"}, "need --display_data=true"),
         ({"display_data": True, "display_ip": "10.0.0.2"}, "--display_port=PORT"),
         ({"display_data": True, "display_path": "life.mp4"}, "files that end in .rrd"),
         ({"display_data": True, "display_path": "there.rrd"}, "exists already"),
-        ({"display_data": True, "display_path": "a.rrd", "display_ip": "::1", "display_port": 9876}, "Say either"),
+        ({"display_data": True, "display_path": "a.rrd", "display_ip": "::1", "display_port": 9876}, "Choose one"),
     ],
 )
 def test_what_cannot_be_shown_is_one_sentence(tmp_path, monkeypatch, no_screen, options, words):

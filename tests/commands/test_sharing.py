@@ -226,13 +226,13 @@ def test_uploads_in_the_background(hub, fault, background):
     uploads.begin()
     uploads.begin()
     assert said == ["upload: the last one is still under way; the next one takes what is new by then."]
-    uploads._process.wait()
+    uploads._upload._process.wait()
     uploads.check()
     assert said[1].startswith("upload: nothing was uploaded: the transfer of the dataset me/room has failed")
     assert said[1].endswith("; try again. The run goes on; the next upload tries again.")
     hub.faults.clear()
     uploads.begin()
-    uploads._process.wait()
+    uploads._upload._process.wait()
     uploads.check()
     assert len(said) == 2, "an upload that works says nothing"
     repo = hub.repo("me/room", "datasets")

@@ -72,7 +72,7 @@ def test_the_background_makes_the_page_and_says_what_failed(tmp_path):
         report = TrainingReport(root, "me/life", page, said.append)
         report.refresh()
         deadline = time.monotonic() + 300
-        while report._process is not None:
+        while report._making is not None:
             assert time.monotonic() < deadline
             time.sleep(0.2)
             report.check()

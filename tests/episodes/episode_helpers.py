@@ -75,6 +75,12 @@ def record(dataset: DurableDataset, episodes: range, depth: bool = False) -> Non
         dataset.save_episode()
 
 
+def record_more(root, episodes: range) -> None:
+    """Go on with a dataset."""
+    with DurableDataset.open(root, REPO_ID) as dataset:
+        record(dataset, episodes)
+
+
 def new_dataset(root, episodes: int, depth: bool = False) -> None:
     """A closed dataset."""
     with DurableDataset.create(REPO_ID, root, depth, "locobot_sim", INFO) as dataset:

@@ -1,1 +1,0 @@
-"""A package that adds a room to relmm."""
