@@ -55,7 +55,7 @@ class Reader:
 
     Args:
         root: its folder.
-        camera: that it must be of, None for any.
+        camera: the camera that it must be of, None for any.
 
     Attributes:
         root: as given.

@@ -7,7 +7,7 @@ from typing import Any
 
 from relmm.learning.progress import Progress, read_metrics
 
-_ATTEMPTS, _STEPS = 20, 200  # that a point of a curve is taken from, at least
+_ATTEMPTS, _STEPS = 20, 200  # each point of a curve covers at least so many
 
 
 def draw_learning_curve(metrics: Path, picture: Path) -> None:

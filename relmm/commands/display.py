@@ -16,7 +16,7 @@ from relmm.errors import ConfigError
 from relmm.geometry import camera_geometry
 from relmm.learning.actor import Actor
 
-_MEMORY = "10%"  # of this machine's, for the viewer; as LeRobot's
+_MEMORY = "10%"  # the viewer's share of this machine's memory, as in LeRobot
 
 
 @dataclass(kw_only=True)
@@ -79,7 +79,7 @@ def live_views(
 
     Args:
         options: what was asked for.
-        command: that shows it.
+        command: its name, which the viewer shows.
         camera: of the robot, by name.
         actor: whose beliefs are shown.
         learning: whether metrics will be shown.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from relmm.fleet.client import Link
 
-_FIRST_WEIGHTS_S = 600.0  # that a robot waits for the learner's first weights
+_FIRST_WEIGHTS_S = 600.0  # how long a robot waits for the learner's first weights
 _RETRY_S = 2.0
 _UNREACHABLE = "it cannot be reached"
 

@@ -20,7 +20,7 @@ _COMMAND = (sys.executable, "-m", "relmm.commands.room")
 _SEED_STEP = 1_000_003  # between rooms: a resumed recording goes on with its seed plus its episodes
 _TRIES = 3  # starts of a room without a single episode, after which something else is wrong
 _LONGEST_PAUSE_S = 30.0  # between a room's end and its next start
-_SAVING_S = 60.0  # that a room may take to end
+_SAVING_S = 60.0  # how long a room may take to save and end
 
 
 class Rooms:

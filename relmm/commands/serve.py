@@ -35,7 +35,7 @@ class ServeFleetConfig:
         token_file: holds the token that the robots must know.
         certificate: of the server, PEM.
         key: of the certificate, PEM.
-        camera: that the robots must have, None for any; the learner refuses those of another camera, too.
+        camera: the camera that robots must have, None for any; the learner checks it as well.
     """
 
     listen: str = "0.0.0.0:50151"

@@ -104,14 +104,14 @@ class _Checkpoints:
     """Checkpoints of a run: those between two of `save_freq` are for those who act, and only the newest are kept.
 
     Args:
-        run: whose they are.
+        run: the run that writes them.
         sources: what it learns from.
     """
 
     def __init__(self, run: Run, sources: Sources) -> None:
         self._run, self._sources = run, sources
         self._kept_at, self._passing = -1, list[Path]()
-        for folder in checkpoint_folders(run.config.checkpoints):  # of before a resume
+        for folder in checkpoint_folders(run.config.checkpoints):  # written before a resume
             self._note(folder, int(folder.name))
 
     def save(self) -> None:

@@ -77,7 +77,7 @@ class Run:
         if self.checkpoint is not None:
             counters = load_training_state(self.checkpoint, self.learner, self.rng)
             self.learned, self.progress.interventions = counters["episodes"], counters.get("interventions", 0)
-        self.listeners: list[Callable[[dict[str, Any]], None]] = []  # to the metrics
+        self.listeners: list[Callable[[dict[str, Any]], None]] = []  # called with each line of the metrics
         assert config.output_dir is not None
         self._tracker: Tracker | None = None
         self._report: TrainingReport | None = None

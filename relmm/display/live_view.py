@@ -31,9 +31,9 @@ from relmm.geometry import OBJECT_HEIGHT, CameraGeometry, moved
 _RECENT = 50  # attempts that a success rate is of
 _NOSE = 0.25  # m, how far the robot's arrow reaches
 _GREY, _BLUE = (130, 140, 155), (60, 120, 240)  # RGB
-_COLOURS = {True: (30, 160, 60), False: (230, 60, 60)}  # of attempts that picked something up, and that failed
+_COLOURS = {True: (30, 160, 60), False: (230, 60, 60)}  # of successful and failed attempts
 _LATELY = 500  # frames of the track, which is sent whole with each frame
-_QUALITY = 75  # of JPEG; a long life has many pictures
+_QUALITY = 75  # JPEG quality: a long run has many pictures
 
 
 class LiveView:

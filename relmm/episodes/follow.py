@@ -72,7 +72,7 @@ def read_episodes(root: Path | str, first: int = 0, camera: str | None = None) -
     Args:
         root: a dataset; it may be being recorded.
         first: number of the first episode to read.
-        camera: that it must be of, None for any.
+        camera: the camera that it must be of, None for any.
 
     Returns:
         An iterator, which raises DatasetError where a listed episode is damaged.
@@ -164,7 +164,7 @@ class EpisodeFollower(RowFollower):
         Args:
             root: the dataset; it need not exist yet.
             first: number of the first episode to read.
-            camera: that it must be of, None for any.
+            camera: the camera that it must be of, None for any.
 
         Raises:
             DatasetError: it exists, and is none that relmm can train on.

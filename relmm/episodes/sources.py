@@ -24,7 +24,7 @@ class Cursor:
 
     Attributes:
         name: the dataset's folder, for messages; and what it is known by if its recorder wrote no runs.
-        episodes: that were learned from, the first ones.
+        episodes: how many of the first ones were learned from.
         runs: with what it was recorded; see `relmm.episodes.upload.recorded_runs`.
     """
 
@@ -42,7 +42,7 @@ class Source:
 
     Args:
         root: its folder; it need not exist yet.
-        camera: that it must be of, None for any.
+        camera: the camera that it must be of, None for any.
 
     Attributes:
         learned: episodes that an earlier run has learned from.
@@ -102,7 +102,7 @@ class Sources:
 
     Args:
         places: each a dataset, or a folder of datasets, which may be joined by others at any time; none need exist yet.
-        camera: that they must be of, None for any.
+        camera: the camera that they must be of, None for any.
         learned: cursors of an earlier run.
 
     Attributes:

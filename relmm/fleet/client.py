@@ -25,7 +25,7 @@ _CALL_S = 20.0  # after which a call that nobody answers is given up
 _LOOK_S = 1.0  # between looks at the dataset
 _HEARTBEAT_S = 10.0
 _LONGEST_PAUSE_S = 30.0  # between attempts, after failures
-_CLOSING_S = 30.0  # that the last episodes may take
+_CLOSING_S = 30.0  # how long sending the last episodes may take
 
 
 class Link:
@@ -46,7 +46,7 @@ class Link:
         self._channel, self._folder, self._name, self._policy = channel, DatasetFolder(root), name, policy
         self._session = ""
         self._sent = 0  # episodes that the server has
-        self._digest = ""  # of the weights that we have
+        self._digest = ""  # SHA-256 of the weights that we have
         self._beat_at = -_HEARTBEAT_S
         self.waiting, self.problem = 0, ""
         self._stop, self._wake = False, threading.Event()
@@ -75,7 +75,7 @@ class Link:
         """After the recording: let the last episodes be sent, as far as that goes in some time.
 
         Args:
-            seconds: that they may take, if the server can be reached.
+            seconds: how long to wait, if the server can be reached.
 
         Returns:
             How many episodes are left.
@@ -99,7 +99,7 @@ class Link:
                 self._register()
             self._send()
             self._beat()
-        except RestartError:  # of another server, or with a message that was answered, but not to us
+        except RestartError:  # another server, or its answer to us was lost
             self._session = ""
             raise
         self.problem = ""

@@ -25,7 +25,7 @@ from relmm.fleet.wire import MAX_EPISODE_BYTES, LinkError, RestartError, number,
 from relmm.geometry import other_camera
 
 _FILES_IN_CHUNK = 1000  # LeRobot's
-_SPARE_BYTES = 1 << 30  # of the disk
+_SPARE_BYTES = 1 << 30  # kept free on the disk
 _LIST_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _LIST_COLUMNS = ("meta/episodes/chunk_index", "meta/episodes/file_index", *PLACE_COLUMNS)
 
@@ -36,7 +36,7 @@ def check_schema(name: str, dataset: Any, camera: str | None) -> None:
     Args:
         name: of the dataset.
         dataset: content of its `meta/relmm.json`.
-        camera: that of the policy, None for any.
+        camera: the policy's, None for any.
 
     Raises:
         FleetError: with the differences.
@@ -63,11 +63,11 @@ class Mirror:
 
     Args:
         root: its folder, which may not exist yet.
-        name: that the robot gives it, `user/name`.
-        camera: that it must be of, None for any.
+        name: the robot's name for it, `user/name`.
+        camera: the camera that it must be of, None for any.
 
     Attributes:
-        episodes: that are whole and durable here.
+        episodes: how many are whole and durable here.
         lock: to be held by whoever uses it.
     """
 
@@ -77,7 +77,7 @@ class Mirror:
         self.episodes = self._frames = 0
         self._tasks: list[str] = []
         self._schema: pa.Schema | None = None
-        self._reader: EpisodeFollower | None = None  # of what is staged
+        self._reader: EpisodeFollower | None = None  # reads the staged episode
         self._partial: _Partial | None = None
 
     def open(self, dataset: dict[str, Any]) -> None:

@@ -35,7 +35,7 @@ _THREADS = 8
 _CALLS_AT_ONCE = 128  # more are sent away to come back later, so that memory is bounded: a message each
 _GONE_S = 60.0  # without a word from a robot
 _LOOK_S = 2.0  # between looks for newer weights
-_FETCHING_S = 30.0  # that weights are kept after somebody has asked for a part of them
+_FETCHING_S = 30.0  # how long weights stay in memory after a robot has asked for a part of them
 
 
 @dataclass
@@ -61,7 +61,7 @@ class FleetServer:
     Args:
         root: folder of the mirrors, `user--name` each; nobody else may write there.
         checkpoints: of the run of relmm-train that learns from them.
-        camera: that the robots must have, None for any.
+        camera: the camera that robots must have, None for any.
     """
 
     def __init__(self, root: Path, checkpoints: Path, camera: str | None = None) -> None:
@@ -79,7 +79,7 @@ class FleetServer:
 
         Args:
             address: HOST:PORT to listen on; port 0 for any that is free.
-            token: that robots must know.
+            token: robots must send it.
             credentials: of `relmm.fleet.wire.server_credentials`.
 
         Returns:

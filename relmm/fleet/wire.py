@@ -15,12 +15,12 @@ from relmm.errors import ConfigError, FleetError, RelmmError
 
 SERVICE = "relmm.Fleet"
 CALLS = ("register", "put", "weights", "heartbeat")
-VERSION = "1"  # of the messages; another one is refused
-CHUNK_BYTES = 256 << 10  # of an episode or of weights in one message
-MESSAGE_BYTES = 2 << 20  # of any message, header included
+VERSION = "1"  # of the protocol; others are refused
+CHUNK_BYTES = 256 << 10  # how much of an episode, or of weights, one message carries
+MESSAGE_BYTES = 2 << 20  # the largest message, header included
 MAX_EPISODE_BYTES = 256 << 20
 MAX_WEIGHTS_BYTES = 2 << 30
-MANY_ROBOTS = 10_000  # of one server: each takes it memory, and a folder
+MANY_ROBOTS = 10_000  # most robots of one server: each needs memory and a folder
 _VERSION_KEY, _TOKEN_KEY = "relmm-version", "authorization"
 _LENGTH = struct.Struct("<I")
 _MIN_TOKEN = 16  # characters

@@ -183,7 +183,7 @@ def read_cursors(checkpoint: Path) -> list[Cursor]:
     """How far each dataset of others has been learned from.
 
     Raises:
-        ConfigError: that is not told as `save_checkpoint` tells it.
+        ConfigError: the file is not as `save_checkpoint` writes it.
     """
     try:
         cursors = [Cursor(**source) for source in read_training_state(checkpoint)["sources"]]

@@ -9,7 +9,7 @@ from relmm.episodes import Episode
 from relmm.learning.progress import Progress
 from relmm.policies.learning import Learner
 
-_SAVING_SHARE = 0.1  # of a learner's time, at most, that goes into weights for those who act
+_SAVING_SHARE = 0.1  # most of a learner's time that saving weights for others may take
 
 
 class Intake:

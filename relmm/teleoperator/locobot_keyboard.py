@@ -28,7 +28,7 @@ HELP = (
 )
 # Shares of a full navigation step. Arrows would end episodes of lerobot-record.
 _DRIVES = {"w": (1.0, 0.0), "a": (0.0, 1.0), "d": (0.0, -1.0), "W": (0.25, 0.0), "A": (0.0, 0.25), "D": (0.0, -0.25)}
-_ROWS, _COLUMNS = 3, 3  # of the numeric keypad: 7 is far and left
+_ROWS, _COLUMNS = 3, 3  # as on a numeric keypad: 7 is far and left
 
 
 class LocobotKeyboard(LocobotTeleoperator):
