@@ -39,7 +39,7 @@ def test_spaces_are_what_stable_baselines3_takes(env: gym.Env[Any, Any]) -> None
     assert env.observation_space.contains(env.step(env.action_space.sample())[0])
 
 
-@pytest.mark.filterwarnings("ignore:The observations returned:UserWarning")  # of a robot that is kept from moving
+@pytest.mark.filterwarnings("ignore:.*The observations returned:UserWarning")  # of a robot that is kept from moving
 def test_actions_are_stretched_to_what_the_robot_can_do(
     env: gym.Env[Any, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
